@@ -1,0 +1,55 @@
+# The entry point of users and of CI. `make` alone lists the targets.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+PYTHON ?=
+WITH_TORCH ?= 0
+PYTEST_ARGS ?=
+DEMO_DIR ?= dataset/FeedingEnv_demo
+BIN := .venv/bin
+ifeq ($(shell uname),Linux)
+export MUJOCO_GL ?= egl
+endif
+
+.PHONY: help demo test test-fast check format setup opengl wheelhouse clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo "Options: PYTHON=python3.12 (makes .venv with it), MUJOCO_GL=egl|osmesa|glfw, PYTEST_ARGS='-k name'"
+
+demo: setup opengl ## five scripted feeding episodes and a preview video
+	$(BIN)/python bin/Rollout.py FeedingEnv --scripted --num_episodes 5 --out $(DEMO_DIR)
+	$(BIN)/python bin/Dataset.py verify $(DEMO_DIR)
+	@echo "Preview video: $$(ls $(DEMO_DIR)/*.mp4)"
+
+test: setup opengl ## every test but the slow ones (under 10 minutes on two cores)
+	$(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)
+
+test-fast: setup ## the tests that need no OpenGL (under a minute)
+	$(BIN)/python -m pytest -n 2 -m "not slow and not gl" $(PYTEST_ARGS)
+
+check: setup ## format, lint, types
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/pyright
+
+format: setup ## format the code and fix what the linter can
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+setup: ## .venv with the pinned packages (every target does this by itself)
+	@.ci/setup $(PYTHON)
+
+opengl: setup
+	@$(BIN)/python robo_manip_baselines/opengl_check.py --install
+
+# PYTHON=3.12 is the Python of the machine that the wheels are for; .venv is left as it is.
+wheelhouse: ## all wheels for a machine without network: make wheelhouse PYTHON=3.12 [WITH_TORCH=1]
+	@.ci/setup
+	$(BIN)/python .ci/wheelhouse.py --python "$(or $(PYTHON),3.12)" $(if $(filter 1,$(WITH_TORCH)),--with_torch)
+
+clean: ## remove what the other targets made, datasets excepted
+	rm -rf .venv wheelhouse build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

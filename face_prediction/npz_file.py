@@ -1,0 +1,94 @@
+"""Reading and writing ``.npz`` files that carry a schema name and a version."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from face_prediction.errors import RequestError
+
+Arrays = dict[str, np.ndarray]
+
+
+def write_npz(path: Path, arrays: Arrays) -> None:
+    """Write ``arrays`` compressed to ``path``, whole or not at all.
+
+    The file is first written under a temporary name in the same folder, so that a run killed at
+    any moment leaves either the old file or the new one.
+
+    Raises:
+        RequestError: the folder cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    except OSError as error:
+        raise RequestError(
+            f"{path.parent}: cannot be written ({error.strerror}); choose another folder"
+        ) from None
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, **arrays)
+        temporary.chmod(0o644)  # mkstemp makes files that only their owner may read
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_npz(path: Path, schema: str, version: int) -> Arrays:
+    """Read every array of the ``.npz`` file at ``path``.
+
+    Raises:
+        RequestError: the file is absent, damaged, of another schema or of another version.
+    """
+    if not path.is_file():
+        raise RequestError(f"{path}: no such file; expected a '{schema}' .npz")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as error:
+        raise RequestError(
+            f"{path}: damaged or not an .npz file ({type(error).__name__}: {error}); make it again"
+        ) from None
+    found = str(arrays["schema"]) if "schema" in arrays else "none"
+    if found != schema:
+        raise RequestError(f"{path}: schema '{found}', expected '{schema}'")
+    found_version = arrays.get("version")
+    if found_version is None or found_version.shape != () or int(found_version) != version:
+        raise RequestError(
+            f"{path}: version {found_version} of '{schema}', this program reads {version}; "
+            "make the file again"
+        )
+    return arrays
+
+
+def require_array(
+    path: Path, arrays: Arrays, key: str, shape: tuple[int | None, ...], kind: str
+) -> np.ndarray:
+    """Return ``arrays[key]`` if it has ``shape`` (None: any length) and a dtype of ``kind``.
+
+    ``kind`` holds the accepted NumPy kind letters, such as ``"f"``, ``"iu"``, ``"b"`` or ``"U"``.
+
+    Raises:
+        RequestError: the key is missing, or its shape or type is another one.
+    """
+    if key not in arrays:
+        raise RequestError(f"{path}: key '{key}' is missing; make the file again")
+    array = arrays[key]
+    fits = len(array.shape) == len(shape) and all(
+        wanted is None or wanted == got for wanted, got in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in kind:
+        wanted_shape = tuple("any" if n is None else n for n in shape)
+        raise RequestError(
+            f"{path}: '{key}' is {array.dtype} {array.shape}, "
+            f"expected kind '{kind}' and shape {wanted_shape}"
+        )
+    return array

@@ -1,0 +1,177 @@
+"""Reading an episode file, without loading its images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from robo_manip_baselines.data.attributes import loaded_attribute
+from robo_manip_baselines.data.images import decode_image, image_checksum
+from robo_manip_baselines.data.schema import (
+    ATTRIBUTES,
+    CHECKSUM_GROUP,
+    FIELD_BY_NAME,
+    FIELDS,
+    IMAGE_GROUP,
+    SCHEMA,
+    SCHEMA_VERSION,
+)
+from robo_manip_baselines.errors import RequestError, require_choice
+
+
+class EpisodeFileError(RequestError):
+    """A file that was given is no whole episode: the message names the file and why."""
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """The attributes of an episode file, JSON parsed, nothing else read.
+
+    Raises:
+        EpisodeFileError: if the file is not there, damaged, or of another schema.
+    """
+    with EpisodeReader(path) as episode:
+        return dict(episode.attributes)
+
+
+class EpisodeReader:
+    """An open episode file. Nothing but attributes is read until it is asked for.
+
+    Use as a context manager. Numbers and frames are checked against their checksums as they are
+    read, so that damage is an error and never wrong data.
+
+    Attributes:
+        path: the file.
+        attributes: name -> value, JSON parsed, vectors as float64 arrays.
+
+    Raises:
+        EpisodeFileError: if the file is not there, damaged, or of another schema or version.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._checksums: dict[str, np.ndarray] = {}
+        self._file = open_hdf5(self.path)
+        try:
+            require_schema(self.path, self._file)
+            self.attributes = {
+                item.name: loaded_attribute(item, self._file.attrs[item.name])
+                for item in ATTRIBUTES
+            }
+        except (KeyError, ValueError, OSError, RuntimeError) as error:
+            self._file.close()
+            if isinstance(error, EpisodeFileError):
+                raise
+            raise EpisodeFileError(f"'{self.path}' is damaged: {one_line(error)}") from error
+
+    def __enter__(self) -> EpisodeReader:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return int(self.attributes["num_steps"])
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras that have images."""
+        return tuple(self.attributes["cameras"])
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Every field of the table, read from the file at each call."""
+        return {field.name: self.array(field.name) for field in FIELDS}
+
+    def array(self, name: str) -> np.ndarray:
+        """One field, all steps.
+
+        Raises:
+            RequestError: for an unknown name.
+            EpisodeFileError: if it is missing or damaged.
+        """
+        require_choice("field", name, FIELD_BY_NAME)
+        return self._read(name, slice(None))
+
+    def encoded_frame(self, camera: str, step: int) -> np.ndarray:
+        """The bytes of one picture, (N,) uint8; with the codec ``raw`` the (H, W, 3) image.
+
+        Raises:
+            RequestError: for a camera or step that the episode does not have.
+            EpisodeFileError: if the bytes are damaged.
+        """
+        require_choice("camera", camera, self.cameras)
+        if not 0 <= step < len(self):
+            raise RequestError(f"'{self.path}' has steps 0…{len(self) - 1}, not {step}")
+        if camera not in self._checksums:
+            self._checksums[camera] = self._read(f"{CHECKSUM_GROUP}/{camera}", slice(None))
+        data = self._read(f"{IMAGE_GROUP}/{camera}", step)
+        if image_checksum(data) != int(self._checksums[camera][step]):
+            raise EpisodeFileError(f"'{self.path}': frame {step} of '{camera}' is damaged")
+        return data
+
+    def frame(self, camera: str, step: int) -> np.ndarray:
+        """One picture, (H, W, 3) uint8 RGB. Raises as `encoded_frame` does."""
+        data = self.encoded_frame(camera, step)
+        try:
+            return decode_image(data)
+        except ValueError as error:
+            raise EpisodeFileError(
+                f"'{self.path}': frame {step} of '{camera}' is {one_line(error)}"
+            ) from error
+
+    def close(self) -> None:
+        """Close the file; may be called again."""
+        self._file.close()
+
+    def _read(self, name: str, index: slice | int) -> np.ndarray:
+        try:
+            dataset = self._file[name]
+            if not isinstance(dataset, h5py.Dataset):
+                raise KeyError(f"'{name}' is no dataset")
+            return np.asarray(dataset[index])
+        except (KeyError, IndexError, OSError, RuntimeError, ValueError, TypeError) as error:
+            raise EpisodeFileError(f"'{self.path}': '{name}': {one_line(error)}") from error
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """Open for reading.
+
+    Raises:
+        EpisodeFileError: if there is no such file, or it is no HDF5 file or a truncated one.
+    """
+    if not path.is_file():
+        raise EpisodeFileError(f"'{path}' is no file")
+    try:
+        return h5py.File(path, "r")
+    except PermissionError as error:
+        raise EpisodeFileError(f"'{path}' cannot be read: permission denied") from error
+    except (OSError, RuntimeError, KeyError) as error:
+        raise EpisodeFileError(
+            f"'{path}' is no HDF5 file, or a damaged one: {one_line(error)}"
+        ) from error
+
+
+def require_schema(path: Path, file: h5py.File) -> None:
+    """Raise `EpisodeFileError` unless this is an episode of the version that this code reads."""
+    schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")
+    if schema != SCHEMA:
+        raise EpisodeFileError(f"'{path}' is no episode: schema {schema!r}, not '{SCHEMA}'")
+    if version != SCHEMA_VERSION:
+        raise EpisodeFileError(
+            f"'{path}' has schema version {version}; this release reads {SCHEMA_VERSION}"
+        )
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an exception as one line."""
+    message = error.args[0] if isinstance(error, KeyError) and error.args else error
+    return " ".join(str(message).split())

@@ -1,0 +1,168 @@
+"""When feeding has succeeded: predicates on geometry, and the state that an episode goes through."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOUTH_TOLERANCE = np.array([0.03, 0.01, 0.01])
+"""m along world x (the face normal), y and z; the spatial condition of Algorithm 1, line 10."""
+
+LIFT_HEIGHT = 0.10
+"""m of the cube's centre above the table from which it counts as lifted: clear of the table by
+twice its size, and low enough that the way to the mouth still lies ahead."""
+
+CAVITY_DEPTH = 0.05
+"""m behind the lips within which a released cube is in the mouth; a cube longer in than this would
+be in the throat."""
+
+CLEAR_DISTANCE = 0.08
+"""m between gripper and mouth from which the gripper has withdrawn: two cube sizes."""
+
+
+class Phase(enum.IntEnum):
+    """How far the task has come. Only ever moves on, except back to REACH before the lift."""
+
+    REACH = 0
+    GRASP = 1
+    CARRY = 2
+    DELIVER = 3
+    RELEASE = 4
+
+
+def is_at_mouth(gripper: NDArray[np.float64], mouth: NDArray[np.float64]) -> bool:
+    """Algorithm 1's spatial condition: within 0.03, 0.01 and 0.01 m, the bounds excluded.
+
+    Args:
+        gripper: (3,) m, world frame.
+        mouth: (3,) m, world frame.
+    """
+    return bool(np.all(np.abs(gripper - mouth) < MOUTH_TOLERANCE))
+
+
+def is_inside_mouth(
+    cube: NDArray[np.float64],
+    mouth: NDArray[np.float64],
+    mouth_axes: NDArray[np.float64],
+    half_width: float,
+    half_height: float,
+) -> bool:
+    """Whether the centre of the cube is in the mouth opening, at or behind the lips.
+
+    Args:
+        cube: (3,) m, world frame.
+        mouth: (3,) m, centre of the opening, world frame.
+        mouth_axes: (3, 3) columns: face normal pointing out, across, up; world frame.
+        half_width: m, of the ellipse that the inner lips span.
+        half_height: m, likewise.
+    """
+    out, across, up = (cube - mouth) @ mouth_axes
+    if not -CAVITY_DEPTH <= out <= 0.0:
+        return False
+    return bool((across / half_width) ** 2 + (up / half_height) ** 2 <= 1.0)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a control step found out.
+
+    Attributes:
+        time: s since the start of the episode.
+        is_held: both fingers touch the cube.
+        is_touched: any finger touches the cube.
+        cube_height: m of the cube's centre above the table.
+        is_at_mouth: see the predicate of that name.
+        is_inside_mouth: likewise.
+        touches_face: the gripper touches lips or face.
+        gripper_distance: m between gripper and mouth.
+    """
+
+    time: float
+    is_held: bool
+    is_touched: bool
+    cube_height: float
+    is_at_mouth: bool
+    is_inside_mouth: bool
+    touches_face: bool
+    gripper_distance: float
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What has happened so far in an episode; ``advance`` gives the next.
+
+    Attributes:
+        phase: see ``Phase``.
+        lift_time: s at which the cube was lifted.
+        success_time: s at which Algorithm 1's condition was first met with the cube held.
+        release_time: s at which the fingers let go of the lifted cube.
+        touched_face: the gripper has touched lips or face since the lift.
+        released_inside: the cube was in the mouth when it was let go.
+        is_clear: the gripper has withdrawn after the release.
+    """
+
+    phase: Phase = Phase.REACH
+    lift_time: float | None = None
+    success_time: float | None = None
+    release_time: float | None = None
+    touched_face: bool = False
+    released_inside: bool = False
+    is_clear: bool = False
+
+    @property
+    def is_success(self) -> bool:
+        """Algorithm 1's spatial condition has been met with the cube held."""
+        return self.success_time is not None
+
+    @property
+    def is_success_strict(self) -> bool:
+        """The cube was let go inside the mouth opening and the gripper never touched the face."""
+        return self.is_success and self.released_inside and not self.touched_face
+
+    @property
+    def completion_time(self) -> float:
+        """s from the lift to the first success; NaN before (paper, Table V)."""
+        if self.success_time is None or self.lift_time is None:
+            return float("nan")
+        return self.success_time - self.lift_time
+
+    def time_since_lift(self, time: float) -> float:
+        """s since the lift; NaN before."""
+        return float("nan") if self.lift_time is None else time - self.lift_time
+
+    def advance(self, facts: Facts) -> Progress:
+        """Take in what one control step found out."""
+        lift_time = self.lift_time
+        if lift_time is None and facts.is_held and facts.cube_height >= LIFT_HEIGHT:
+            lift_time = facts.time
+        lifted = lift_time is not None
+        success_time = self.success_time
+        if success_time is None and lifted and facts.is_held and facts.is_at_mouth:
+            success_time = facts.time
+        release_time, released_inside = self.release_time, self.released_inside
+        if release_time is None and lifted and not facts.is_touched:
+            release_time, released_inside = facts.time, facts.is_inside_mouth
+        released = release_time is not None
+        return replace(
+            self,
+            phase=_phase(facts, lifted, success_time is not None, released),
+            lift_time=lift_time,
+            success_time=success_time,
+            release_time=release_time,
+            touched_face=self.touched_face or (lifted and facts.touches_face),
+            released_inside=released_inside,
+            is_clear=self.is_clear or (released and facts.gripper_distance >= CLEAR_DISTANCE),
+        )
+
+
+def _phase(facts: Facts, lifted: bool, succeeded: bool, released: bool) -> Phase:
+    if released:
+        return Phase.RELEASE
+    if succeeded:
+        return Phase.DELIVER
+    if lifted:
+        return Phase.CARRY
+    return Phase.GRASP if facts.is_held else Phase.REACH

@@ -1,0 +1,27 @@
+"""The one error that means "the request was wrong", and how its message is phrased."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class RequestError(ValueError):
+    """The user asked for something that cannot be done: one line, no traceback, exit code 2.
+
+    The message says what was given, what is valid and what to do.
+    """
+
+
+def require_choice(what: str, given: str, valid: Iterable[str]) -> str:
+    """Return ``given`` if it is one of ``valid``.
+
+    Raises:
+        RequestError: naming the valid choices, and the nearest one if there is any.
+    """
+    choices = sorted(valid)
+    if given in choices:
+        return given
+    close = difflib.get_close_matches(given, choices, n=1)
+    hint = f" (did you mean '{close[0]}'?)" if close else ""
+    raise RequestError(f"unknown {what} '{given}'{hint}; valid: {', '.join(choices)}")

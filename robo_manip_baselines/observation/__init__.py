@@ -1,0 +1,7 @@
+"""What a policy is shown: which components, in which order, and how they are built from truth."""
+
+from robo_manip_baselines.observation.error import ERRORS
+from robo_manip_baselines.observation.spec import CAMERAS, PRESETS, ObservationSpec
+from robo_manip_baselines.observation.truth import Truth, observe
+
+__all__ = ["CAMERAS", "ERRORS", "PRESETS", "ObservationSpec", "Truth", "observe"]

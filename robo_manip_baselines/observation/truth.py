@@ -1,0 +1,79 @@
+"""From what is true to what is observed: ``truth -> error -> components``, on any batch shape.
+
+Legend: ... any leading shape (none in an environment, (T,) for an episode, (B, T) for a batch),
+A arms, K = 6 frames from now to the longest horizon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robo_manip_baselines.observation.error import ERRORS
+from robo_manip_baselines.observation.spec import ObservationSpec
+
+FRAME_PERIOD = 1.0 / 30.0
+"""s between two frames of the recorded motion and of the prediction (paper, section IV.A)."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is so in the world, before anything corrupts it. SI units, world frame.
+
+    Attributes:
+        time: (...) s since the start of the episode.
+        joint_position: (..., A, 6) rad.
+        joint_velocity: (..., A, 6) rad/s.
+        gripper_position: (..., A) m, position of a finger.
+        gripper_velocity: (..., A) m/s.
+        end_effector_position: (..., 3) m, gripper site of the right arm.
+        mouth_position: (..., K, 3) m, now and 1 ... 5 frames ahead.
+        object_position: (..., 3) m, centre of the cube.
+    """
+
+    time: NDArray[np.float64]
+    joint_position: NDArray[np.float64]
+    joint_velocity: NDArray[np.float64]
+    gripper_position: NDArray[np.float64]
+    gripper_velocity: NDArray[np.float64]
+    end_effector_position: NDArray[np.float64]
+    mouth_position: NDArray[np.float64]
+    object_position: NDArray[np.float64]
+
+
+def observe(spec: ObservationSpec, truth: Truth) -> dict[str, NDArray[np.float32]]:
+    """Build every vector of an observation; images are added by whoever has them.
+
+    Args:
+        spec: what to show.
+        truth: with any leading shape.
+
+    Returns:
+        The vectors that ``spec.components()`` names, float32 of shape (..., n).
+    """
+    arms = np.concatenate(
+        [
+            truth.joint_position,
+            truth.joint_velocity,
+            truth.gripper_position[..., None],
+            truth.gripper_velocity[..., None],
+        ],
+        axis=-1,
+    )
+    parts = {"state": arms.reshape(*arms.shape[:-2], -1)}
+    if spec.frames:
+        mouth = ERRORS[spec.error](truth.mouth_position[..., : spec.frames, :])
+        distance = np.linalg.norm(mouth - truth.end_effector_position[..., None, :], axis=-1)
+        if spec.obs == "current":
+            parts["mouth"] = np.concatenate([mouth[..., 0, :], distance], axis=-1)
+        else:
+            time = truth.time[..., None] + np.arange(spec.frames) * FRAME_PERIOD
+            timed = np.concatenate([time[..., None], mouth], axis=-1)
+            parts["prediction"] = np.concatenate(
+                [timed.reshape(*timed.shape[:-2], -1), distance], axis=-1
+            )
+    if spec.object_pose:
+        parts["object_position"] = truth.object_position
+    return {name: value.astype(np.float32) for name, value in parts.items()}
