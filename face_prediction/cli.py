@@ -27,7 +27,10 @@ def commands() -> list[tuple[str, type, Callable[[Any], int | None]]]:
     try:
         from face_prediction.surface import ExportSurfaceOptions, export_surface
     except ImportError:
-        return [("extract", ExtractOptions, run_extract),("export-motion", ExportMotionOptions, run_export_motion)]
+        return [
+            ("extract", ExtractOptions, run_extract),
+            ("export-motion", ExportMotionOptions, run_export_motion),
+        ]
 
     return [
         ("extract", ExtractOptions, run_extract),
@@ -43,9 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
     known = commands()
-    kinds = tuple(
-        Annotated[options, tyro.conf.subcommand(name=name)] for name, options, _ in known
-    )
+    kinds = tuple(Annotated[options, tyro.conf.subcommand(name=name)] for name, options, _ in known)
     union: Any = kinds[0]
     for kind in kinds[1:]:
         union = union | kind

@@ -63,7 +63,7 @@ class FaceDetector:
     def __init__(self, model: Path, settings: DetectorSettings) -> None:
         vision, base_options, self._mediapipe = _import_mediapipe()
         self._settings = settings
-        self._model = model
+        self.model = model
         mode = vision.RunningMode.IMAGE
         faces = settings.num_faces
         if settings.running_mode == "video":
@@ -127,7 +127,7 @@ class FaceDetector:
         return {
             "name": "MediaPipe FaceLandmarker",
             "version": self._mediapipe.__version__,
-            "model_sha256": sha256_of(self._model),
+            "model_sha256": sha256_of(self.model),
             "smoothed": self._settings.running_mode == "video",
             **vars(self._settings),
         }

@@ -15,10 +15,12 @@ import numpy as np
 
 from face_prediction.detector import DetectorSettings, FaceDetection, FaceDetector
 from face_prediction.errors import NoFaceError, RequestError
+from face_prediction.face_geometry import read_canonical_face
 from face_prediction.lifting import jaw_openings
 from face_prediction.resample import MAX_GAP, Samples, resample
 from face_prediction.tracks import NUM_LANDMARKS, FaceTrack, load_track
 from face_prediction.video import VideoFrame, VideoReader, sha256_of
+from face_prediction.zoom import ZoomingDetector, face_box
 
 logger = logging.getLogger(__name__)
 
@@ -40,12 +42,16 @@ class ExtractSettings:
     fps: float | None = DEFAULT_FPS
     #: Longest time in seconds between two decoded frames that is interpolated across.
     max_gap: float = MAX_GAP
+    #: Look at small faces through a window (image mode only).
+    zoom: bool = True
 
     def __post_init__(self) -> None:
         if self.fps is not None and not (0.0 < self.fps <= 1000.0):
             raise RequestError(f"--fps {self.fps}: between 0 and 1000, or None")
         if not 0.0 <= self.max_gap <= 1.0:
             raise RequestError(f"--max_gap {self.max_gap}: between 0 and 1 s")
+        if self.zoom and self.detector.running_mode == "video":
+            raise RequestError("--zoom works with --running_mode image only; add --zoom False")
 
 
 class ProgressFactory(Protocol):
@@ -56,9 +62,7 @@ class ProgressFactory(Protocol):
     ) -> Iterable[VideoFrame]: ...
 
 
-def no_progress(
-    frames: Iterable[VideoFrame], total: int | None, name: str
-) -> Iterable[VideoFrame]:
+def no_progress(frames: Iterable[VideoFrame], total: int | None, name: str) -> Iterable[VideoFrame]:
     """Shows nothing."""
     return frames
 
@@ -97,15 +101,10 @@ class FaceFollower:
         return faces[index]
 
 
-def face_box(face: FaceDetection, image_size: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """Middle (2,) and width of the box around a face, in pixels."""
-    points = face.landmarks[:, :2] * image_size
-    low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2, float(high[0] - low[0])
-
-
 def extract_track(
-    path: Path, detector: FaceDetector, settings: ExtractSettings,
+    path: Path,
+    detector: FaceDetector,
+    settings: ExtractSettings,
     progress: ProgressFactory = no_progress,
 ) -> FaceTrack:
     """Read the video at ``path`` and follow one face through it.
@@ -120,6 +119,9 @@ def extract_track(
         follower = FaceFollower()
         times: list[float] = []
         found: list[FaceDetection | None] = []
+        zooming = None
+        if settings.zoom:
+            zooming = ZoomingDetector(detector.detect, read_canonical_face(detector.model))
         several = 0
         size = (0, 0)
         for frame in progress(video.frames(), info.expected_frames or None, path.name):
@@ -127,10 +129,17 @@ def extract_track(
             if times and (width, height) != size:
                 raise RequestError(f"{path}: its image size changes at {frame.time:.2f} s")
             size = (width, height)
-            faces = detector.detect(frame.image, frame.time)
+            faces = (
+                zooming.detect(frame.image, frame.time)
+                if zooming
+                else (detector.detect(frame.image, frame.time))
+            )
             several += len(faces) > 1
             times.append(frame.time)
-            found.append(follower.choose(faces, frame.time, size))
+            face = follower.choose(faces, frame.time, size)
+            if zooming and face is not None:
+                face = zooming.refine(face, frame.image, frame.time)
+            found.append(face)
     source = {
         "name": path.name,
         "sha256": source_hash,
@@ -138,6 +147,8 @@ def extract_track(
         "frames_with_face": sum(face is not None for face in found),
         "frames_with_several_faces": several,
         "reacquired": follower.reacquired,
+        "frames_zoomed": zooming.frames if zooming else 0,
+        "zoom_windows": zooming.windows if zooming else 0,
         "average_rate": info.average_rate,
         "variable_rate": is_variable_rate(times),
     }
@@ -183,7 +194,7 @@ def build_track(
         source_timestamps=samples.timestamps,
         source_valid=samples.valid,
         source=source,
-        detector={**detector, "resampling": settings_record},
+        detector={**detector, "settings": settings_record},
     )
 
 
@@ -209,6 +220,6 @@ def is_up_to_date(
         raise RequestError(f"{error}; it is in the way of a track, so remove it first") from None
     wanted = {
         **detector,
-        "resampling": {k: v for k, v in asdict(settings).items() if k != "detector"},
+        "settings": {k: v for k, v in asdict(settings).items() if k != "detector"},
     }
     return track.source.get("sha256") == source_hash and dict(track.detector) == wanted

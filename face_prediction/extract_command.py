@@ -51,6 +51,8 @@ class ExtractOptions:
     min_detection_confidence: float = 0.5
     #: Least score of the landmark network's "a face is present".
     min_presence_confidence: float = 0.5
+    #: Look at small faces through a still window three faces wide (with image only).
+    zoom: Annotated[bool, tyro.conf.FlagConversionOff] = True
     #: Show a progress bar for every video.
     progress: Annotated[bool, tyro.conf.FlagConversionOff] = True
 
@@ -73,6 +75,7 @@ def run_extract(options: ExtractOptions) -> int:
         ),
         fps=options.fps,
         max_gap=options.max_gap,
+        zoom=options.zoom,
     )
     outputs = output_paths(options.videos, options.out)
     model = find_model(options.model)

@@ -60,7 +60,9 @@ def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Sam
     return Samples(wanted, landmarks, head_pose, valid), between & valid
 
 
-def _mix(array: np.ndarray, before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _mix(
+    array: np.ndarray, before: np.ndarray, after: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
     filled = np.nan_to_num(array)  # NaN * 0 would spoil a frame that its neighbour does not enter
     w = weight.reshape(-1, *([1] * (array.ndim - 1)))
     return (1 - w) * filled[before] + w * filled[after]

@@ -17,7 +17,7 @@ import select
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, NoReturn, TypeVar, cast, overload
 
 import tyro
 
@@ -85,6 +85,26 @@ def run_command(main: Callable[[], int | None]) -> NoReturn:
     sys.exit(code)
 
 
+@overload
+def parse(
+    options_type: type[Options],
+    example: str,
+    *,
+    description: str | None = None,
+    args: Sequence[str] | None = None,
+) -> Options: ...
+
+
+@overload
+def parse(
+    options_type: Any,
+    example: str,
+    *,
+    description: str | None = None,
+    args: Sequence[str] | None = None,
+) -> Any: ...
+
+
 def parse(
     options_type: Any,
     example: str,
@@ -141,7 +161,10 @@ def _call_tyro(options_type: Any, description: str, args: Sequence[str]) -> tupl
             if isinstance(cause, RequestError):
                 raise cause from None
             cause = cause.__cause__ or cause.__context__
-        raise RequestError(f"{_box_to_line(errors.getvalue())}; {_help_hint()}") from None
+        message = _box_to_line(errors.getvalue())
+        if message.startswith("Expected one of") and args:  # a subcommand
+            message = f"'{args[0]}' is no subcommand: {message[0].lower()}{message[1:]}"
+        raise RequestError(f"{message}; {_help_hint()}") from None
 
 
 def _unknown_message(

@@ -134,12 +134,9 @@ class EpisodeReader:
 
     def _read(self, name: str, index: slice | int) -> np.ndarray:
         try:
-            dataset = self._file[name]
-            if not isinstance(dataset, h5py.Dataset):
-                raise KeyError(f"'{name}' is no dataset")
-            return np.asarray(dataset[index])
+            return np.asarray(dataset_of(self._file, name)[index])
         except (KeyError, IndexError, OSError, RuntimeError, ValueError, TypeError) as error:
-            raise EpisodeFileError(f"'{self.path}': '{name}': {one_line(error)}") from error
+            raise EpisodeFileError(f"'{self.path}': '{name}' {one_line(error)}") from error
 
 
 def open_hdf5(path: Path) -> h5py.File:
@@ -169,6 +166,14 @@ def require_schema(path: Path, file: h5py.File) -> None:
         raise EpisodeFileError(
             f"'{path}' has schema version {version}; this release reads {SCHEMA_VERSION}"
         )
+
+
+def dataset_of(file: h5py.File, name: str) -> h5py.Dataset:
+    """The dataset of that name; raises KeyError if there is none."""
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise KeyError("is missing" if dataset is None else "is no dataset")
+    return dataset
 
 
 def one_line(error: BaseException) -> str:

@@ -120,7 +120,7 @@ def _phases(config: FeedingExpertConfig, home: Command) -> list[Phase]:
         return Command(view.object_position + height, DOWN, FINGER_OPEN)
 
     def lifted(view: View, last: Command) -> Command:
-        return replace(last, position=last.position + [0.0, 0.0, LIFT])
+        return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
 
     def standoff(view: View, last: Command) -> Command:
         return Command(STANDOFF, LEVEL, last.finger)

@@ -2,6 +2,6 @@
 
 from robo_manip_baselines.observation.error import ERRORS
 from robo_manip_baselines.observation.spec import CAMERAS, PRESETS, ObservationSpec
-from robo_manip_baselines.observation.truth import Truth, observe
+from robo_manip_baselines.observation.truth import FRAME_PERIOD, Truth, observe
 
-__all__ = ["CAMERAS", "ERRORS", "PRESETS", "ObservationSpec", "Truth", "observe"]
+__all__ = ["CAMERAS", "ERRORS", "FRAME_PERIOD", "PRESETS", "ObservationSpec", "Truth", "observe"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import mujoco
@@ -25,7 +25,6 @@ from robo_manip_baselines.envs.mujoco.vx300s import (
     FINGER_CLOSED,
     FINGER_OPEN,
     HOME_QPOS,
-    JOINT_LIMITS,
 )
 from robo_manip_baselines.errors import require_choice
 from robo_manip_baselines.observation import ObservationSpec, Truth, observe
@@ -61,7 +60,10 @@ class FaceEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
     each step what has been achieved.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / CONTROL_PERIOD)}
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1.0 / CONTROL_PERIOD),
+    }
 
     def __init__(
         self,
@@ -226,6 +228,28 @@ class FaceEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
     def gripper_position(self) -> NDArray[np.float64]:
         """(3,) m, world: site ``right/gripper``."""
         return self.data.site_xpos[self._gripper_site].copy()
+
+    @property
+    def gripper_orientation(self) -> NDArray[np.float64]:
+        """(4,) wxyz, world from the site ``right/gripper``."""
+        quat = np.empty(4)
+        mujoco.mju_mat2Quat(quat, self.data.site_xmat[self._gripper_site])
+        return quat
+
+    @property
+    def head_orientation(self) -> NDArray[np.float64]:
+        """(4,) wxyz, world from head; identity for an upright face that looks along world +x."""
+        return self.data.mocap_quat[self._mocap["face/head"]].copy()
+
+    @property
+    def joint_names(self) -> list[str]:
+        """The columns of joint positions and velocities."""
+        return [f"{arm}/{joint}" for arm in self.observation_spec.arm_names for joint in ARM_JOINTS]
+
+    @property
+    def action_names(self) -> list[str]:
+        """The elements of an action."""
+        return [self.model.actuator(actuator).name for actuator in self._actuators]
 
     @property
     def mouth_track(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""When feeding has succeeded: predicates on geometry, and the state that an episode goes through."""
+"""When feeding has succeeded: predicates on geometry, and how far an episode has come."""
 
 from __future__ import annotations
 

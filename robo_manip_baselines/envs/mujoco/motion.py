@@ -58,7 +58,7 @@ class MotionSegment:
         clip: id of the clip.
         subject: id of the person.
         start: first frame, counted from the start of the run.
-        run: index of the run in the library.
+        index: the same frame, counted from the start of the library.
     """
 
     fps: float
@@ -68,7 +68,7 @@ class MotionSegment:
     clip: str
     subject: str
     start: int
-    run: int
+    index: int
 
     def at(
         self, time: ArrayLike
@@ -213,7 +213,7 @@ class MotionLibrary:
             clip=self.run_clip[run],
             subject=self.run_subject[run],
             start=start,
-            run=run,
+            index=begin,
         )
 
 

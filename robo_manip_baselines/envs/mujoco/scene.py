@@ -172,7 +172,7 @@ def _set_visual(spec: mujoco.MjSpec) -> None:
     visual.quality.offsamples = 0
     visual.quality.shadowsize = 2048
     visual.quality.numslices = 16
-    visual.quality.numstacks = 8
+    visual.quality.numstacks = 4
     visual.quality.numquads = 1
     visual.headlight.ambient = (0.38, 0.38, 0.38)
     visual.headlight.diffuse = (0.30, 0.30, 0.30)
@@ -189,7 +189,8 @@ def _add_room(spec: mujoco.MjSpec) -> None:
     box = mujoco.mjtGeom.mjGEOM_BOX
     spec.add_material(name="table", rgba=(0.72, 0.62, 0.49, 1), specular=0.1, shininess=0.1)
     spec.add_material(name="table_frame", rgba=(0.33, 0.34, 0.36, 1), specular=0.2)
-    spec.add_material(name="floor", rgba=(0.60, 0.64, 0.68, 1), specular=0.0)
+    spec.add_material(name="floor", rgba=(0.52, 0.55, 0.58, 1), specular=0.0)
+    spec.add_material(name="wall", rgba=(0.80, 0.81, 0.80, 1), specular=0.0)
     width, depth, thickness = _TABLE_HALF
     world.add_geom(
         name="table",
@@ -212,23 +213,35 @@ def _add_room(spec: mujoco.MjSpec) -> None:
                 contype=0,
                 conaffinity=0,
             )
-    world.add_geom(
-        name="floor",
-        type=box,
-        size=(3.0, 3.0, 0.01),
-        pos=(0, BASE_Y, -_TABLE_HEIGHT - 0.01),
-        material="floor",
-        contype=0,
-        conaffinity=0,
-    )
-    world.add_light(
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        pos=(0.6, -0.4, 2.0),
-        dir=(-0.35, 0.5, -0.8),
-        diffuse=(0.55, 0.55, 0.53),
-        specular=(0.25, 0.25, 0.25),
-        castshadow=True,
-    )
+    # A floor and two walls: all that the cameras see behind the table.
+    for name, size, position in (
+        ("floor", (3.0, 3.0, 0.01), (0, BASE_Y, -_TABLE_HEIGHT - 0.01)),
+        ("wall_back", (3.0, 0.01, 2.0), (0, BASE_Y + 3.0, 2.0 - _TABLE_HEIGHT)),
+        ("wall_left", (0.01, 3.0, 2.0), (-3.0, BASE_Y, 2.0 - _TABLE_HEIGHT)),
+    ):
+        world.add_geom(
+            name=name,
+            type=box,
+            size=size,
+            pos=position,
+            material="floor" if name == "floor" else "wall",
+            contype=0,
+            conaffinity=0,
+        )
+    # A key light from the front right, above, and a weak one opposite, to give shape to the side
+    # that the key light leaves dark. A directional light's position is the centre of its shadows.
+    for direction, diffuse, shadow in (
+        ((-0.35, 0.5, -0.8), 0.5, True),
+        ((0.6, 0.3, -0.5), 0.2, False),
+    ):
+        world.add_light(
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            pos=np.array([0, BASE_Y, 0.2]) - 2.0 * np.array(direction),
+            dir=direction,
+            diffuse=(diffuse, diffuse, diffuse),
+            specular=(0.2, 0.2, 0.2) if shadow else (0, 0, 0),
+            castshadow=shadow,
+        )
     mouth = (0.0, BASE_Y, 0.35)
     azimuth, elevation, distance = math.radians(-35), math.radians(20), 0.5
     front = (
@@ -237,8 +250,8 @@ def _add_room(spec: mujoco.MjSpec) -> None:
         mouth[2] + distance * math.sin(elevation),
     )
     for name, position, target, fovy in (
-        ("top", (0.05, BASE_Y, 1.15), (0.05, BASE_Y, 0.0), 55.0),
-        ("angle", (0.35, -0.35, 0.75), (0.08, BASE_Y, 0.18), 45.0),
+        ("top", (0.08, BASE_Y, 1.15), (0.08, BASE_Y, 0.0), 48.0),
+        ("angle", (0.60, -0.35, 0.72), (0.10, BASE_Y, 0.18), 45.0),
         ("front_close", front, mouth, FRONT_CLOSE_FOVY),
     ):
         world.add_camera(name=name, pos=position, quat=look_at(position, target), fovy=fovy)

@@ -1,0 +1,22 @@
+"""Look at and check a folder of episodes: ``python bin/Dataset.py verify dataset/FeedingEnv``."""
+
+from __future__ import annotations
+
+from robo_manip_baselines.command import parse, run_command
+from robo_manip_baselines.data.dataset_command import Command
+
+
+def main() -> int:
+    """Run the subcommand that was asked for."""
+    options = parse(
+        Command,
+        example="python bin/Dataset.py verify dataset/FeedingEnv",
+        description="Look at and check a folder of episodes.",
+    )
+    text, code = options.run()
+    print(text)
+    return code
+
+
+if __name__ == "__main__":
+    run_command(main)

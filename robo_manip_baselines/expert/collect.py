@@ -1,0 +1,247 @@
+"""Collecting demonstrations: many seeds, several processes, and never twice the same one."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import logging
+import signal
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from tqdm import tqdm
+
+from robo_manip_baselines.data import (
+    atomic_file,
+    episode_path,
+    finished_seeds,
+    prepare_folder,
+    read_metadata,
+    remove_temporaries,
+    write_episode,
+)
+from robo_manip_baselines.data.images import CODECS, DEFAULT_QUALITY
+from robo_manip_baselines.envs.mujoco.registration import env_id, make_env
+from robo_manip_baselines.errors import RequestError, require_choice
+from robo_manip_baselines.expert.demonstrate import demonstrate
+from robo_manip_baselines.expert.feeding import EXPERTS
+
+SUMMARY = "summary.json"
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What to collect, and how.
+
+    Attributes:
+        env: name of the environment.
+        out: folder of the demonstrations; failed episodes go to its ``failed/``.
+        expert: a name of ``EXPERTS``.
+        seeds: of the episodes, one each.
+        env_kwargs: arguments of the environment.
+        codec, quality: of the images.
+        workers: processes.
+    """
+
+    env: str
+    out: Path
+    expert: str
+    seeds: range
+    env_kwargs: dict[str, Any]
+    codec: str = "jpeg"
+    quality: int = DEFAULT_QUALITY
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        env_id(self.env)
+        require_choice("expert", self.expert, EXPERTS)
+        require_choice("image codec", self.codec, CODECS)
+        if len(self.seeds) < 1 or self.seeds.start < 0:
+            raise RequestError(
+                f"{len(self.seeds)} episodes from seed {self.seeds.start}: "
+                "both must be whole numbers, at least 1 and 0"
+            )
+        if self.workers < 1:
+            raise RequestError(f"workers {self.workers}: must be at least 1")
+        if not 1 <= self.quality <= 100:
+            raise RequestError(f"image quality {self.quality}: must be 1 to 100")
+
+    def path(self, seed: int) -> Path | None:
+        """Return the file of a finished seed, wherever it is; None if there is none."""
+        for success in (True, False):
+            path = episode_path(self.out, seed, success)
+            if path.is_file():
+                return path
+        return None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a collection went.
+
+    Attributes:
+        episodes: how many there are.
+        successes, strict_successes: how many of them succeeded.
+        failed_seeds: seeds that did not.
+        completion_time_mean, completion_time_sd: s, over successes; None without any.
+        steps: control steps of the episodes that this run recorded.
+        steps_per_second: of this run, all workers together; None if nothing was left to do.
+    """
+
+    episodes: int
+    successes: int
+    strict_successes: int
+    failed_seeds: list[int]
+    completion_time_mean: float | None
+    completion_time_sd: float | None
+    steps: int
+    steps_per_second: float | None
+
+
+def collect(collection: Collection) -> Summary:
+    """Record every seed that has not been recorded yet, and write ``summary.json``.
+
+    Killed at any moment, it leaves whole episodes only; the same call carries on from there.
+
+    Raises:
+        RequestError: the request cannot be met; nothing has been written then.
+    """
+    # Everything about the request that can be wrong is found out here, before any file exists.
+    with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
+        env.reset(seed=collection.seeds.start)
+        _refuse_other_settings(collection, env)
+        prepare_folder(collection.out)
+        remove_temporaries(collection.out)
+        done = finished_seeds(collection.out)
+        todo = [seed for seed in collection.seeds if seed not in done]
+        if len(todo) < len(collection.seeds):
+            logger.info(
+                "%d of %d episodes are there already",
+                len(collection.seeds) - len(todo),
+                len(collection.seeds),
+            )
+        steps, begin = 0, time.perf_counter()
+        with tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress:
+            for count in _record_all(collection, env, todo):
+                steps += count
+                progress.update()
+        elapsed = time.perf_counter() - begin
+    summary = summarise(collection, steps, steps / elapsed if todo else None)
+    _write_summary(collection, summary)
+    return summary
+
+
+def summarise(collection: Collection, steps: int, steps_per_second: float | None) -> Summary:
+    """Sum up what the files of a collection say."""
+    outcomes = {
+        seed: read_metadata(path) for seed in collection.seeds if (path := collection.path(seed))
+    }
+    times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
+    return Summary(
+        episodes=len(outcomes),
+        successes=len(times),
+        strict_successes=sum(bool(o["is_success_strict"]) for o in outcomes.values()),
+        failed_seeds=[seed for seed, o in outcomes.items() if not o["is_success"]],
+        completion_time_mean=float(np.mean(times)) if times else None,
+        completion_time_sd=float(np.std(times, ddof=1)) if len(times) > 1 else None,
+        steps=steps,
+        steps_per_second=steps_per_second,
+    )
+
+
+def _record_all(
+    collection: Collection, env: gymnasium.Env[Any, Any], seeds: list[int]
+) -> Iterator[int]:
+    """Record seeds, here or in worker processes; yield the steps of each as it is finished."""
+    workers = min(collection.workers, len(seeds))
+    if workers <= 1:
+        for seed in seeds:
+            yield _record(collection, env, seed)
+        return
+    # Spawned, not forked: an OpenGL context does not survive a fork.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (collection,))
+    try:
+        futures = [pool.submit(_record_in_worker, seed) for seed in seeds]
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> int:
+    """Record one episode into its file; return its number of steps."""
+    demonstration = demonstrate(
+        env, collection.expert, seed, codec=collection.codec, quality=collection.quality
+    )
+    path = episode_path(collection.out, seed, demonstration.attributes["is_success"])
+    write_episode(path, demonstration.arrays, demonstration.images, demonstration.attributes)
+    return len(demonstration.arrays["time"])
+
+
+_worker: dict[str, Any] = {}
+"""What a worker process keeps between its episodes; empty in every other process."""
+
+
+def _start_worker(collection: Collection) -> None:
+    # Ctrl-C reaches the whole process group: workers stop at once, the parent does the talking.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    env = make_env(collection.env, **collection.env_kwargs)
+    atexit.register(env.close)
+    _worker.update(collection=collection, env=env)
+
+
+def _record_in_worker(seed: int) -> int:
+    return _record(_worker["collection"], _worker["env"], seed)
+
+
+def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:
+    """Refuse to mix episodes of other settings with those that the folder holds.
+
+    Raises:
+        RequestError: naming the first setting that differs.
+    """
+    if not collection.out.is_dir():
+        return
+    paths = (collection.path(seed) for seed in sorted(finished_seeds(collection.out)))
+    present = next((path for path in paths if path), None)
+    if present is None:
+        return
+    there = read_metadata(present)
+    wanted = {
+        "env_id": env_id(collection.env),
+        # As JSON would give them back: tuples become lists.
+        "env_kwargs": json.loads(json.dumps(collection.env_kwargs)),
+        "expert": collection.expert,
+        "image_codec": collection.codec,
+        "image_quality": collection.quality,
+        "xml_hash": env.unwrapped.xml_hash,
+    }
+    for name, value in wanted.items():
+        if there[name] != value:
+            raise RequestError(
+                f"'{collection.out}' holds episodes with {name} {there[name]}, not {value}; "
+                "give another --out or remove that folder"
+            )
+
+
+def _write_summary(collection: Collection, summary: Summary) -> None:
+    content = {
+        "env": env_id(collection.env),
+        "env_kwargs": collection.env_kwargs,
+        "expert": collection.expert,
+        "first_seed": collection.seeds.start,
+        "workers": collection.workers,
+        **asdict(summary),
+    }
+    with atomic_file(collection.out / SUMMARY) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

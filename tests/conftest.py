@@ -1,0 +1,55 @@
+"""What every test shares: the rendering backend, the development clips, hypothesis' profiles."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+# MuJoCo chooses its backend on first import: before any test module is collected.
+if sys.platform == "linux":
+    os.environ.setdefault("MUJOCO_GL", "egl")
+
+from robo_manip_baselines.opengl_check import opengl_problem
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# Time limits fail by chance on a busy machine. The same examples are drawn on every run, unless
+# HYPOTHESIS_PROFILE=explore asks for many new ones.
+hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None)
+hypothesis.settings.register_profile("explore", deadline=None, max_examples=1000)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+
+
+def shared_problem() -> tuple[Path, str | None]:
+    """Return the folder of development data and why it cannot be used, if so."""
+    folder = Path(os.environ.get("RMB_SHARED") or ROOT.parent / "shared")
+    if (folder / "faces").is_dir():
+        return folder, None
+    return folder, f"no development clips: {folder / 'faces'} is not there (set $RMB_SHARED)"
+
+
+@pytest.fixture(scope="session")
+def shared_dir() -> Path:
+    """The folder of development data (clips of faces, the detector's model); skips where absent."""
+    folder, problem = shared_problem()
+    if problem:
+        pytest.skip(problem)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the source tree."""
+    return ROOT
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip, with the reason, what this machine cannot run."""
+    if item.get_closest_marker("gl") and (problem := opengl_problem()):
+        pytest.skip(problem)
+    if item.get_closest_marker("shared") and (problem := shared_problem()[1]):
+        pytest.skip(problem)

@@ -1,0 +1,54 @@
+"""Importing the packages needs no GPU, OpenGL, MediaPipe or display, and loads none of them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = {"torch", "mediapipe", "matplotlib", "tensorflow", "jax", "sounddevice"}
+GRAPHICS = {"OpenGL", "glfw"}
+
+IMPORT = """
+import importlib, sys
+importlib.import_module({package!r})
+print(*{{name.partition(".")[0] for name in sys.modules}})
+"""
+
+IMPORT_ALL = """
+import importlib, pkgutil, sys
+package = importlib.import_module({package!r})
+for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+    importlib.import_module(module.name)
+print(*{{name.partition(".")[0] for name in sys.modules}})
+"""
+
+
+def modules_after(program: str) -> set[str]:
+    """Return the top-level modules that are loaded when ``program`` has run, warnings as errors."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "PYTHONPATH")}
+    environment["MUJOCO_GL"] = "disabled"  # importing mujoco opens the backend's libraries else
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return set(result.stdout.split())
+
+
+@pytest.mark.parametrize("package", ["robo_manip_baselines", "face_prediction"])
+def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
+    loaded = modules_after(IMPORT.format(package=package))
+    assert package in loaded
+    assert loaded & (HEAVY | GRAPHICS | {"mujoco"}) == set()
+
+
+@pytest.mark.parametrize("package", ["robo_manip_baselines", "face_prediction"])
+def test_every_module_imports_without_opengl_and_mediapipe(package: str) -> None:
+    loaded = modules_after(IMPORT_ALL.format(package=package))
+    assert loaded & (HEAVY | GRAPHICS) == set()
