@@ -1,7 +1,7 @@
 """Let an expert act in an environment and record its episodes."""
 
 from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.expert.rollout import EXAMPLE, RolloutOptions, rollout
+from robo_manip_baselines.expert.rollout_command import EXAMPLE, RolloutOptions, rollout
 
 
 def main() -> None:

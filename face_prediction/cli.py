@@ -13,6 +13,8 @@ from face_prediction.errors import RequestError
 from face_prediction.extract_command import ExtractOptions, run_extract
 from face_prediction.motion_command import ExportMotionOptions, run_export_motion
 
+logger = logging.getLogger(__name__)
+
 DESCRIPTION = """Faces in video: tracks, and the recorded motion lifted from them.
 
 Example:
@@ -62,8 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run = next(run for _, kind, run in known if isinstance(options, kind))
         return run(options) or 0
     except RequestError as error:
-        print(f"face-prediction: {error}", file=sys.stderr)
+        logger.error("face-prediction: %s", error)
         return 2
     except KeyboardInterrupt:
-        print("face-prediction: interrupted; finished files are kept", file=sys.stderr)
+        logger.error("face-prediction: interrupted; finished files are kept")
         return 130

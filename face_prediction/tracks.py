@@ -27,7 +27,7 @@ class FaceTrack:
     """One face of one video at a constant rate.
 
     Frames without a face, and frames that could only be guessed across a gap, have ``valid``
-    False and NaN in every other array.
+    False and NaN in the others.
     """
 
     #: (T, 468, 3) float32: x right / image width, y down / image height, and MediaPipe's relative
@@ -42,7 +42,8 @@ class FaceTrack:
     #: (T, 4, 4) float64, metres: camera from head. Camera frame: x right in the image, y up,
     #: z toward the camera. Head frame: MediaPipe's canonical face (x subject's left, y up, z out).
     head_pose: np.ndarray
-    #: (T,) float32, metres between the inner lips (landmarks 13 and 14)
+    #: (T,) float32, metres between the inner lips (landmarks 13 and 14); NaN also where the mouth
+    #: is seen from the side
     jaw: np.ndarray
     #: (width, height) in pixels, as displayed
     image_size: tuple[int, int]
@@ -134,7 +135,7 @@ def _check_values(path: Path, track: FaceTrack) -> None:
     steps = np.diff(track.timestamps)
     if not np.all(np.isfinite(track.timestamps)) or np.any(steps <= 0):
         raise RequestError(f"{path}: 'timestamps' must be finite and increasing")
-    for key in ("landmarks", "head_pose", "jaw"):
+    for key in ("landmarks", "head_pose"):
         array = getattr(track, key)
         if not np.all(np.isfinite(array[track.valid])):
             raise RequestError(f"{path}: '{key}' holds NaN or infinity in a frame marked valid")

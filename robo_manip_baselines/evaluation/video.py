@@ -183,9 +183,12 @@ def put_caption(image: np.ndarray, text: str) -> np.ndarray:
 
 def _paint(image: np.ndarray, opacity: np.ndarray, colour: Colour) -> np.ndarray:
     """Lay a colour over an image, opacity (H, W) uint8 from 0 to 255."""
-    weight = opacity[..., None] / np.float32(255)
-    mixed = image * (1 - weight) + np.asarray(colour, dtype=np.float32) * weight
-    return np.round(mixed).astype(np.uint8)
+    painted = image.copy()
+    touched = opacity > 0
+    weight = opacity[touched][:, None] / np.float32(255)
+    mixed = image[touched] * (1 - weight) + np.asarray(colour, dtype=np.float32) * weight
+    painted[touched] = np.round(mixed).astype(np.uint8)
+    return painted
 
 
 def _add_line(

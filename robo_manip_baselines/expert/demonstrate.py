@@ -116,7 +116,7 @@ def _attributes(env: gymnasium.Env[Any, Any], world: FeedingEnv) -> dict[str, An
         "env_kwargs": dict(env.spec.kwargs),
         "is_success": progress.is_success,
         "is_success_strict": progress.is_success_strict,
-        "completion_time": progress.completion_time,
+        "completion_time": np.nan if progress.completion_time is None else progress.completion_time,
         "motion_clip": segment.clip,
         "motion_subject": segment.subject,
         "motion_start_index": segment.index,

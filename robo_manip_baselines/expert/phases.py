@@ -46,13 +46,13 @@ class View:
     Attributes:
         object_position: (3,) m, world.
         mouth_track: (K, 3) m, world: the mouth now and 1 ... 5 frames of 1/30 s ahead.
-        time_since_lift: s; NaN before.
+        time_since_lift: s; None before.
         is_at_mouth: Algorithm 1's spatial condition holds now.
     """
 
     object_position: NDArray[np.float64]
     mouth_track: NDArray[np.float64]
-    time_since_lift: float
+    time_since_lift: float | None
     is_at_mouth: bool
 
     def mouth(self, lead: float = 0.0) -> NDArray[np.float64]:
@@ -163,15 +163,17 @@ class Approach:
     def step(self, view: View) -> Command:
         """Move by velocity times control period."""
         # Below one control period, the step would go past the mouth.
-        left = max(self._limit - view.time_since_lift, CONTROL_PERIOD)
+        elapsed = view.time_since_lift or 0.0
+        left = max(self._limit - elapsed, CONTROL_PERIOD)
         velocity = (view.mouth(self._lead) - self._command.position) / left
         position = self._command.position + velocity * CONTROL_PERIOD
         self._command = replace(self._command, position=position)
         return self._command
 
     def is_done(self, view: View) -> bool:
-        """Done at the mouth, or when the time is up."""
-        return view.is_at_mouth or not view.time_since_lift <= self._limit
+        """Done at the mouth, when the time is up, or at once if nothing was lifted."""
+        elapsed = view.time_since_lift
+        return view.is_at_mouth or elapsed is None or elapsed > self._limit
 
 
 class Follow:

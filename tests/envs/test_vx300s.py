@@ -160,8 +160,10 @@ def test_joint_limits_are_the_published_ones(model: mujoco.MjModel) -> None:
     for arm in ARM_BASES:
         for joint, _, _, limits in CHAIN:
             assert vx300s.JOINT_LIMITS[joint] == pytest.approx(limits, abs=1e-12)
-            for kind in (model.joint(f"{arm}/{joint}").range,
-                         model.actuator(f"{arm}/{joint}").ctrlrange):
+            for kind in (
+                model.joint(f"{arm}/{joint}").range,
+                model.actuator(f"{arm}/{joint}").ctrlrange,
+            ):
                 assert tuple(kind) == pytest.approx(limits, abs=1e-10)
         fingers = (vx300s.FINGER_CLOSED, vx300s.FINGER_OPEN)
         assert fingers == (0.021, 0.057)
@@ -177,9 +179,7 @@ def test_home_pose_is_within_the_limits() -> None:
 
 
 @pytest.mark.parametrize("inertial", INERTIALS, ids=lambda inertial: inertial[0])
-def test_masses_and_inertias_are_the_published_ones(
-    model: mujoco.MjModel, inertial: tuple
-) -> None:
+def test_masses_and_inertias_are_the_published_ones(model: mujoco.MjModel, inertial: tuple) -> None:
     name, mass, centre, rpy, (xx, yy, zz, xy, xz, yz) = inertial
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     frame = from_rpy(rpy)
@@ -212,22 +212,23 @@ def test_pads_meet_when_closed_and_are_72_mm_apart_when_open(model: mujoco.MjMod
         assert centres - left.size[1] - right.size[1] == pytest.approx(gap, abs=1e-9)
 
 
-def test_pads_are_centred_on_the_gripper_site_and_end_just_behind_the_cubes_face(
+def test_pads_are_centred_on_the_gripper_site_and_the_tips_end_behind_the_cubes_face(
     model: mujoco.MjModel,
 ) -> None:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     site = data.site("right/gripper")
+    to_site = site.xmat.reshape(3, 3).T
     for side in ("left", "right"):
         pad = model.geom(f"right/{side}_finger_pad")
-        ahead, _, above = site.xmat.reshape(3, 3).T @ (data.geom(pad.id).xpos - site.xpos)
+        ahead, _, above = to_site @ (data.geom(pad.id).xpos - site.xpos)
         assert (ahead, above) == pytest.approx((0, 0), abs=1e-9)
-        # The tip is what reaches furthest: behind the face of a 4 cm cube held at the site.
-        body = pad.bodyid[0]
-        tips = [
-            (site.xmat.reshape(3, 3).T @ (data.geom(g).xpos - site.xpos))[0] + model.geom_rbound[g]
-            for g in range(model.ngeom)
-            if model.geom_bodyid[g] == body and g != pad.id and model.geom_contype[g]
-        ]
-        assert pad.size[0] <= 0.02
-        assert len(tips) == 2
+        assert pad.size[2] == pytest.approx(0.01)  # 2 cm thick: fits under a cube's top, 4 cm
+        boxes = np.flatnonzero(model.geom_bodyid == pad.bodyid[0])
+        assert np.all(model.geom_type[boxes] == mujoco.mjtGeom.mjGEOM_BOX)
+        tip = max(
+            (to_site @ (data.geom_xpos[box] - site.xpos))[0]
+            + np.abs(to_site @ data.geom_xmat[box].reshape(3, 3))[0] @ model.geom_size[box]
+            for box in boxes
+        )
+        assert 0.015 < tip < 0.02  # half of the 4 cm cube is 0.02

@@ -25,6 +25,19 @@ for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
 print(*{{name.partition(".")[0] for name in sys.modules}})
 """
 
+# The state-only variant, for clusters whose nodes have no OpenGL.
+ACT_BLIND = """
+import sys
+import gymnasium
+import robo_manip_baselines
+env = gymnasium.make("robo_manip_baselines/FeedingEnv-v0", cameras=(), object_pose=True)
+env.reset(seed=0)
+for _ in range(3):
+    env.step(env.action_space.sample())
+env.close()
+print(*{name.partition(".")[0] for name in sys.modules})
+"""
+
 
 def modules_after(program: str) -> set[str]:
     """Return the top-level modules that are loaded when ``program`` has run, warnings as errors."""
@@ -51,4 +64,10 @@ def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
 @pytest.mark.parametrize("package", ["robo_manip_baselines", "face_prediction"])
 def test_every_module_imports_without_opengl_and_mediapipe(package: str) -> None:
     loaded = modules_after(IMPORT_ALL.format(package=package))
+    assert loaded & (HEAVY | GRAPHICS) == set()
+
+
+def test_the_state_only_environment_needs_no_opengl() -> None:
+    loaded = modules_after(ACT_BLIND)
+    assert "mujoco" in loaded
     assert loaded & (HEAVY | GRAPHICS) == set()

@@ -95,8 +95,8 @@ class FeedingEnv(FaceEnv):
     | ``mouth_position`` | (3,) | true mouth (m) |
     | ``gripper_position`` | (3,) | site ``right/gripper`` (m) |
     | ``phase`` | str | reach, grasp, carry, deliver or release |
-    | ``time_since_lift`` | float | s; NaN before |
-    | ``completion_time`` | float | s from the lift to ``is_success``; NaN before |
+    | ``time_since_lift`` | float or None | s; None before |
+    | ``completion_time`` | float or None | s from the lift to ``is_success``; None before |
     | ``face_force`` | float | N, the largest normal force between the robot and the face in the
     step |
 

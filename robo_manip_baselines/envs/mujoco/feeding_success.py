@@ -15,6 +15,9 @@ LIFT_HEIGHT = 0.10
 """m of the cube's centre above the table from which it counts as lifted: clear of the table by
 twice its size, and low enough that the way to the mouth still lies ahead."""
 
+LIP_DEPTH = 0.01
+"""m by which the lips stand out before the mouth's centre, the mean of all lip landmarks."""
+
 CAVITY_DEPTH = 0.05
 """m behind the lips within which a released cube is in the mouth; a cube longer in than this would
 be in the throat."""
@@ -50,7 +53,7 @@ def is_inside_mouth(
     half_width: float,
     half_height: float,
 ) -> bool:
-    """Whether the centre of the cube is in the mouth opening, at or behind the lips.
+    """Whether the centre of the cube is in the mouth opening, past the front of the lips.
 
     Args:
         cube: (3,) m, world frame.
@@ -60,7 +63,7 @@ def is_inside_mouth(
         half_height: m, likewise.
     """
     out, across, up = (cube - mouth) @ mouth_axes
-    if not -CAVITY_DEPTH <= out <= 0.0:
+    if not -CAVITY_DEPTH <= out <= LIP_DEPTH:
         return False
     return bool((across / half_width) ** 2 + (up / half_height) ** 2 <= 1.0)
 
@@ -123,15 +126,15 @@ class Progress:
         return self.is_success and self.released_inside and not self.touched_face
 
     @property
-    def completion_time(self) -> float:
-        """s from the lift to the first success; NaN before (paper, Table V)."""
+    def completion_time(self) -> float | None:
+        """s from the lift to the first success; None before (paper, Table V)."""
         if self.success_time is None or self.lift_time is None:
-            return float("nan")
+            return None
         return self.success_time - self.lift_time
 
-    def time_since_lift(self, time: float) -> float:
-        """s since the lift; NaN before."""
-        return float("nan") if self.lift_time is None else time - self.lift_time
+    def time_since_lift(self, time: float) -> float | None:
+        """s since the lift; None before."""
+        return None if self.lift_time is None else time - self.lift_time
 
     def advance(self, facts: Facts) -> Progress:
         """Take in what one control step found out."""

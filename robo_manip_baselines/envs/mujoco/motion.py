@@ -137,7 +137,7 @@ class MotionLibrary:
         if not source.is_file():
             raise RequestError(f"motion library '{source}' does not exist; {remedy}")
         try:
-            with np.load(source, allow_pickle=False) as archive:
+            with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
                 content = {key: archive[key] for key in archive.files}
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -156,7 +156,7 @@ class MotionLibrary:
             run_length=content["run_length"].astype(np.int64),
             run_clip=tuple(str(clip) for clip in content["run_clip"]),
             run_subject=tuple(str(subject) for subject in content["run_subject"]),
-            metadata=json.loads(str(content["metadata"])) if "metadata" in content else {},
+            metadata=json.loads(str(content["metadata"])),
             source=source,
         )
 
@@ -221,8 +221,15 @@ def _find_problem(content: dict[str, NDArray[Any]]) -> str | None:
     """Return what is wrong with the arrays of a library file, or None."""
     if str(content.get("schema")) != SCHEMA:
         return f"schema is '{content.get('schema')}', not '{SCHEMA}'"
-    if int(content.get("version", np.array(-1))) != VERSION:
+    if str(content.get("version")) != str(VERSION):
         return f"version is {content.get('version')}, this release reads {VERSION}"
+    fps = content.get("fps", np.array(0.0))
+    if fps.shape or fps.dtype.kind not in "fi" or not 0.0 < float(fps) < np.inf:
+        return "'fps' must be one positive number"
+    try:
+        json.loads(str(content["metadata"]))
+    except (KeyError, ValueError):
+        return "'metadata' is missing or not JSON"
     for name, (ndim, kind) in _ARRAYS.items():
         if name not in content:
             return f"'{name}' is missing"
@@ -233,6 +240,8 @@ def _find_problem(content: dict[str, NDArray[Any]]) -> str | None:
     frames = len(content["time"])
     if content["mouth"].shape != (frames, 3) or content["orientation"].shape != (frames, 4):
         return "'mouth' and 'orientation' must have a row per frame, of 3 and 4 numbers"
+    if len(content["jaw"]) != frames:
+        return "'jaw' must have a number per frame"
     if not np.allclose(np.linalg.norm(content["orientation"], axis=1), 1.0, atol=1e-3):
         return "'orientation' holds quaternions that are not of unit length"
     start, length = content["run_start"], content["run_length"]
@@ -241,6 +250,4 @@ def _find_problem(content: dict[str, NDArray[Any]]) -> str | None:
         return "the run_* arrays differ in length"
     if (start < 0).any() or (length < 1).any() or (start + length > frames).any():
         return "a run lies outside the frames"
-    if not float(content.get("fps", np.array(0.0))) > 0.0:
-        return "'fps' must be positive"
     return None

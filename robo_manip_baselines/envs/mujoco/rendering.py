@@ -16,6 +16,7 @@ import contextlib
 import importlib
 import os
 import platform
+import sys
 import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
@@ -69,9 +70,7 @@ class CameraRenderer:
         self._cameras = {model.camera(i).name: i for i in range(model.ncam)}
         self._target: _Target | None = None
 
-    def render(
-        self, data: mujoco.MjData, cameras: Sequence[str]
-    ) -> dict[str, NDArray[np.uint8]]:
+    def render(self, data: mujoco.MjData, cameras: Sequence[str]) -> dict[str, NDArray[np.uint8]]:
         """Return the views of ``cameras`` at the state ``data``.
 
         The scene is updated once and seen by every camera. ``data`` must have been through
@@ -146,7 +145,10 @@ class _Target:
                 "this renderer was opened before the process forked; open one in each worker"
             )
         self._gl.make_current()
-        yield
+        try:
+            yield
+        finally:
+            _let_go()
 
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, cameras: Sequence[int]
@@ -216,6 +218,14 @@ def _make_context(model: mujoco.MjModel, height: int, width: int) -> tuple[Any, 
             f"no OpenGL to draw cameras with ({backend}: {reason}){fix} "
             "(--cameras none needs no OpenGL)"
         ) from error
+
+
+def _let_go() -> None:
+    """Leave this thread without an OpenGL context, where the backend has a way to."""
+    if backend := sys.modules.get("mujoco.egl"):
+        egl = backend.EGL
+        none = egl.EGL_NO_SURFACE
+        egl.eglMakeCurrent(backend.EGL_DISPLAY, none, none, egl.EGL_NO_CONTEXT)
 
 
 def _close_all() -> None:

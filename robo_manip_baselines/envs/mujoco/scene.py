@@ -6,7 +6,6 @@ needs a head, a cube or anything else adds it to the spec before compiling.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -242,16 +241,11 @@ def _add_room(spec: mujoco.MjSpec) -> None:
             specular=(0.2, 0.2, 0.2) if shadow else (0, 0, 0),
             castshadow=shadow,
         )
-    mouth = (0.0, BASE_Y, 0.35)
-    azimuth, elevation, distance = math.radians(-35), math.radians(20), 0.5
-    front = (
-        mouth[0] + distance * math.cos(elevation) * math.cos(azimuth),
-        mouth[1] + distance * math.cos(elevation) * math.sin(azimuth),
-        mouth[2] + distance * math.sin(elevation),
-    )
+    # front_close sees the mouth from half a metre, from the side of the arm that does not feed and
+    # from its own height: from above, pitching heads hide their mouths from a detector.
     for name, position, target, fovy in (
         ("top", (0.08, BASE_Y, 1.15), (0.08, BASE_Y, 0.0), 48.0),
         ("angle", (0.60, -0.35, 0.72), (0.10, BASE_Y, 0.18), 45.0),
-        ("front_close", front, mouth, FRONT_CLOSE_FOVY),
+        ("front_close", (0.383, BASE_Y - 0.321, 0.35), (0.0, BASE_Y, 0.35), FRONT_CLOSE_FOVY),
     ):
         world.add_camera(name=name, pos=position, quat=look_at(position, target), fovy=fovy)

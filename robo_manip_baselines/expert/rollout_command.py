@@ -8,12 +8,16 @@ from pathlib import Path
 
 import tyro
 
+from robo_manip_baselines.data import list_episodes
 from robo_manip_baselines.data.images import DEFAULT_QUALITY
 from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.evaluation.preview import write_preview
 from robo_manip_baselines.expert.collect import Collection, Summary, collect
 from robo_manip_baselines.observation import CAMERAS
 
 logger = logging.getLogger(__name__)
+
+PREVIEW = "preview.mp4"
 
 EXAMPLE = "python bin/Rollout.py FeedingEnv --scripted --num_episodes 50 --workers 2"
 
@@ -66,7 +70,11 @@ def rollout(options: RolloutOptions) -> None:
         raise RequestError(f"preview {options.preview}: must be 0 or more episodes")
     collection = to_collection(options)
     summary = collect(collection)
-    print(table(collection, summary))  # noqa: T201
+    episodes = list_episodes(collection.out)[: options.preview]
+    video = collection.out / PREVIEW if episodes else None
+    if video:
+        _preview(video, episodes)
+    print(table(collection, summary, video))  # noqa: T201
 
 
 def to_collection(options: RolloutOptions) -> Collection:
@@ -107,7 +115,12 @@ def parse_image_size(size: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
-def table(collection: Collection, summary: Summary) -> str:
+def _preview(video: Path, episodes: list[Path]) -> None:
+    logger.info("drawing a preview of %d episodes", len(episodes))
+    write_preview(video, episodes)
+
+
+def table(collection: Collection, summary: Summary, video: Path | None) -> str:
     """Lay out the closing table."""
     mean, spread = summary.completion_time_mean, summary.completion_time_sd
     rate = summary.steps_per_second
@@ -121,6 +134,7 @@ def table(collection: Collection, summary: Summary) -> str:
         "speed": "-" if rate is None else f"{rate:.0f} steps/s",
         "failed seeds": ", ".join(map(str, summary.failed_seeds)) or "-",
         "written to": str(collection.out),
+        "preview": str(video or "-"),
     }
     width = max(map(len, rows))
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())

@@ -1,0 +1,122 @@
+"""What of the face can be touched: its outside by robots, the inside of its mouth by the cube.
+
+Contact bits: the outside (contype 2) meets robots only, never the cube, because soft lips give
+way to food; the inside of the mouth (contype 4) meets the cube only, and holds it once released.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from robo_manip_baselines.envs.mujoco.face_model import (
+    REST_OPENING,
+    FaceModel,
+    hinge_quaternion,
+    rotate,
+)
+
+_HIDDEN: Final[dict[str, Any]] = {"mass": 0, "group": 3, "conaffinity": 0, "rgba": (0.9, 0.5, 0.2, 0.4)}
+_OUTSIDE: Final[dict[str, Any]] = {**_HIDDEN, "contype": 2}
+_INSIDE: Final[dict[str, Any]] = {**_HIDDEN, "contype": 4}
+
+_LIP_RADIUS: Final = 0.004
+_UPPER_CHAIN: Final = (78, 80, 82, 312, 310, 308)
+_LOWER_CHAIN: Final = (308, 318, 317, 87, 88, 78)
+"""Landmarks of the inner lips that the capsules run between, corner to corner."""
+
+_ELLIPSOIDS: Final = (
+    # body, name, half axes, centre (head: body frame; jaw and torso: from their own origin)
+    ("head", "skull", (0.100, 0.076, 0.100), (-0.055, 0.0, 0.022)),
+    ("head", "cheeks", (0.060, 0.070, 0.040), (-0.015, 0.0, -0.005)),
+    ("head", "nose", (0.020, 0.013, 0.026), (0.052, 0.0, -0.004)),
+    ("jaw", "chin", (0.022, 0.024, 0.012), (0.038, 0.0, -0.072)),
+)
+
+_MOUTH_BOXES: Final = (
+    # name, half sizes, centre in the mouth frame, tilt about y (positive: front edge up... )
+    ("tongue_floor", (0.037, 0.035, 0.006), (-0.038, 0.0, -0.034), -0.07),
+    ("cheek_left", (0.036, 0.006, 0.036), (-0.042, 0.040, 0.0), 0.0),
+    ("cheek_right", (0.036, 0.006, 0.036), (-0.042, -0.040, 0.0), 0.0),
+    ("throat", (0.006, 0.040, 0.036), (-0.082, 0.0, 0.0), 0.0),
+    ("palate", (0.036, 0.035, 0.006), (-0.042, 0.0, 0.040), 0.0),
+)
+
+
+def add_collision(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
+    """Add the collision geoms to the bodies ``head``, ``jaw``, ``mouth`` and ``torso``."""
+    for owner, name, size, centre in _ELLIPSOIDS:
+        body[owner].add_geom(
+            name=f"face/{name}",
+            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+            size=size,
+            pos=centre,
+            **_OUTSIDE,
+        )
+    _add_neck_and_bust(body)
+    _add_lips(body, model)
+    for name, size, centre, tilt in _MOUTH_BOXES:
+        body["mouth"].add_geom(
+            name=f"face/{name}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=size,
+            pos=centre,
+            quat=(np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0),
+            friction=(1.0, 0.01, 0.0001),
+            **_INSIDE,
+        )
+
+
+def _add_neck_and_bust(body: Mapping[str, mujoco.MjsBody]) -> None:
+    capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+    body["head"].add_geom(
+        name="face/neck",
+        type=capsule,
+        size=(0.052, 0, 0),
+        fromto=(-0.055, 0, -0.03, -0.060, 0, -0.12),
+        **_OUTSIDE,
+    )
+    body["torso"].add_geom(
+        name="face/shoulders",
+        type=capsule,
+        size=(0.085, 0, 0),
+        fromto=(-0.134, -0.125, -0.240, -0.134, 0.125, -0.240),
+        **_OUTSIDE,
+    )
+    body["torso"].add_geom(
+        name="face/chest",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(0.095, 0.195, 0.11),
+        pos=(-0.136, 0, -0.34),
+        **_OUTSIDE,
+    )
+
+
+def _add_lips(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
+    """Ten capsules inside the lips, upper ones on the head, lower ones on the jaw.
+
+    They lie where the lips are at `REST_OPENING`, midway between inner and outer edge, so that
+    they leave the opening itself free.
+    """
+    angle = model.jaw_angle(REST_OPENING)
+    at = model.deform(angle)
+    back = hinge_quaternion(angle) * [1, -1, -1, -1]
+    outer = dict(zip(model.rings["lips_inner"].tolist(), model.rings["lips_outer"].tolist(), strict=True))
+    count = 0
+    for owner, chain in (("head", _UPPER_CHAIN), ("jaw", _LOWER_CHAIN)):
+        inner = np.array(chain)
+        line = 0.5 * (at[inner] + at[[outer[i] for i in chain]]) - [_LIP_RADIUS, 0.0, 0.0]
+        if owner == "jaw":
+            line = rotate(back, line - model.hinge)
+        for start, end in zip(line[:-1], line[1:], strict=True):
+            body[owner].add_geom(
+                name=f"face/lip_{count}",
+                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                size=(_LIP_RADIUS, 0, 0),
+                fromto=np.concatenate([start, end]),
+                **_OUTSIDE,
+            )
+            count += 1

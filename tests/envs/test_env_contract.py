@@ -1,0 +1,225 @@
+"""What every registered environment promises (after dm_control's suite tests)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import robo_manip_baselines  # noqa: F401  (registers the environments)
+from robo_manip_baselines.envs.mujoco.registration import ENVS, env_id, make_env
+from robo_manip_baselines.errors import RequestError
+
+STEPS = 40
+
+# Warnings are errors. The one exception is advice, not a finding: actions are joint targets in
+# radians within the arm's published limits, which are neither symmetric nor within [-1, 1].
+ADVICE = "ignore:.*For Box action spaces, we recommend using a symmetric and normalized space"
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "baseline": {"obs": "baseline"},
+    "current": {"obs": "current", "object_pose": True},
+    "current_pred": {"obs": "current_pred", "horizon": 5, "object_pose": True},
+    "both arms": {"obs": "current_pred", "horizon": 1, "arms": "both"},
+    "after lift": {"obs": "current", "face_motion": "after_lift"},
+}
+
+
+@pytest.fixture(params=sorted(ENVS))
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(params=sorted(VARIANTS))
+def env(name: str, request: pytest.FixtureRequest) -> Iterator[gymnasium.Env[Any, Any]]:
+    env = make_env(name, cameras=(), **VARIANTS[request.param])
+    yield env
+    env.close()
+
+
+def wander(env: gymnasium.Env[Any, Any], seed: int, steps: int = STEPS) -> list[dict[str, Any]]:
+    """Reset, then act at random around the present pose; return what was observed."""
+    rng = np.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    observations = [observation]
+    low, high = env.action_space.low, env.action_space.high
+    for _ in range(steps):
+        action = rng.uniform(low, high).astype(np.float32)
+        observation, *_ = env.step(action)
+        observations.append(observation)
+    return observations
+
+
+@pytest.mark.filterwarnings(ADVICE)
+def test_check_env_has_nothing_to_say(env: gymnasium.Env[Any, Any]) -> None:
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_observations_fit_the_space_and_are_finite(env: gymnasium.Env[Any, Any]) -> None:
+    for observation in wander(env, seed=3):
+        assert env.observation_space.contains(observation)
+        for key, value in observation.items():
+            assert np.isfinite(value).all(), key
+
+
+def test_same_seed_same_trajectory_bit_for_bit(env: gymnasium.Env[Any, Any]) -> None:
+    first, other, second = wander(env, seed=5), wander(env, seed=6), wander(env, seed=5)
+    for a, b in zip(first, second, strict=True):
+        for key in a:
+            np.testing.assert_array_equal(a[key], b[key])
+    assert any((first[-1][key] != other[-1][key]).any() for key in first[-1])
+
+
+def test_observations_share_no_memory(env: gymnasium.Env[Any, Any]) -> None:
+    observations = wander(env, seed=1, steps=2)
+    for key in observations[0]:
+        assert not np.shares_memory(observations[0][key], observations[1][key]), key
+        assert not np.shares_memory(observations[1][key], observations[2][key]), key
+
+
+def test_no_element_of_an_observation_is_constant(env: gymnasium.Env[Any, Any]) -> None:
+    seen = [wander(env, seed) for seed in range(4)]
+    for key in seen[0][0]:
+        values = np.stack([observation[key] for run in seen for observation in run])
+        constant = np.flatnonzero(np.ptp(values, axis=0) == 0.0)
+        names = env.unwrapped.observation_spec.components()[key]
+        assert not len(constant), f"{key}: {[names[i] for i in constant]}"
+
+
+def test_every_component_is_named(env: gymnasium.Env[Any, Any]) -> None:
+    components = env.unwrapped.observation_spec.components()
+    spaces = env.observation_space.spaces
+    assert {key: (len(names),) for key, names in components.items()} == {
+        key: space.shape for key, space in spaces.items()
+    }
+    for names in components.values():
+        assert len(set(names)) == len(names)
+
+
+def test_the_start_is_really_random(env: gymnasium.Env[Any, Any]) -> None:
+    world = env.unwrapped
+    cubes, mouths, segments = [], [], set()
+    for seed in range(20):
+        env.reset(seed=seed)
+        cubes.append(world.object_position())
+        mouths.append(world.mouth_track[0])
+        segments.add(world.segment.index)
+    # Of a uniform spread of 0.1 m, twenty draws cover less than half with odds below 1e-5.
+    assert (np.ptp(cubes, axis=0)[:2] > 0.05).all()
+    assert (np.ptp(mouths, axis=0) > 0.05).all()
+    assert len(segments) > 15
+
+
+def test_info_has_the_promised_keys_and_types(env: gymnasium.Env[Any, Any]) -> None:
+    _, info = env.reset(seed=0)
+    _, _, _, _, later = env.step(env.action_space.sample())
+    for told in (info, later):
+        assert isinstance(told["is_success"], bool)
+        assert isinstance(told["is_success_strict"], bool)
+        assert told["mouth_position"].shape == told["gripper_position"].shape == (3,)
+        assert told["phase"] == "reach"
+        assert told["time_since_lift"] is None
+        assert told["completion_time"] is None
+        assert told["face_force"] == 0.0
+
+
+def test_truncates_after_twelve_seconds(name: str) -> None:
+    env = make_env(name, cameras=())
+    env.reset(seed=0)
+    world = env.unwrapped
+    stay = np.array([*world.data.ctrl[world.model.actuator("right/waist").id :]][:7], np.float32)
+    for step in range(1, 601):
+        _, _, terminated, truncated, _ = env.step(stay)
+        assert not terminated
+        assert truncated is (step == 600)
+    assert world.time == pytest.approx(12.0)
+    env.close()
+
+
+def test_actions_are_bounded_and_checked(env: gymnasium.Env[Any, Any]) -> None:
+    env.reset(seed=0)
+    space = env.action_space
+    assert np.isfinite(space.low).all()
+    assert np.isfinite(space.high).all()
+    with pytest.raises(ValueError, match="finite numbers"):
+        env.unwrapped.step(np.full(space.shape, np.nan))
+    with pytest.raises(ValueError, match="finite numbers"):
+        env.unwrapped.step(np.zeros(3))
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_vector_environments_give_what_single_ones_give(name: str, mode: str) -> None:
+    options: dict[str, Any] = {"cameras": (), "obs": "current"}
+    vector = gymnasium.make_vec(env_id(name), num_envs=2, vectorization_mode=mode, **options)
+    single = make_env(name, **options)
+    together, _ = vector.reset(seed=[7, 8])
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(vector.action_space.low, vector.action_space.high, (5, 2, 7))
+    for action in actions.astype(np.float32):
+        together, *_ = vector.step(action)
+    for row, seed in enumerate((7, 8)):
+        alone, _ = single.reset(seed=seed)
+        for action in actions.astype(np.float32):
+            alone, *_ = single.step(action[row])
+        for key in alone:
+            np.testing.assert_array_equal(alone[key], together[key][row])
+    vector.close()
+    single.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"obs": "currant"}, "unknown observation preset 'currant' .*did you mean 'current'"),
+        ({"cameras": ("wrist",)}, "unknown camera 'wrist'.*valid: angle, front_close, top"),
+        ({"cameras": ("top", "top")}, "each may be named once"),
+        ({"horizon": 0}, "horizon 0: must be 1 to 5"),
+        ({"horizon": 6}, "horizon 6: must be 1 to 5"),
+        ({"image_size": (0, 640)}, "image size"),
+        ({"error": "cosmic"}, "unknown error model 'cosmic'"),
+        ({"arms": "left"}, "unknown arms 'left'; valid: both, right"),
+        ({"face_motion": "never"}, "unknown face motion 'never'"),
+        ({"clips": ("nobody",)}, "unknown clip 'nobody'"),
+        ({"motion_library": "nowhere.npz"}, "'nowhere.npz' does not exist"),
+        ({"render_mode": "ansi"}, "unknown render mode 'ansi'"),
+    ],
+)
+def test_bad_arguments_get_one_clear_line(
+    name: str, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(RequestError, match=message) as caught:
+        make_env(name, **{"cameras": (), **arguments}).unwrapped  # noqa: B018
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_environments_are_named() -> None:
+    with pytest.raises(RequestError, match="unknown environment 'FeedinEnv' .*'FeedingEnv'"):
+        make_env("FeedinEnv")
+
+
+@pytest.mark.gl
+def test_cameras_are_drawn_in_the_asked_size(name: str) -> None:
+    env = make_env(name, cameras=("top", "front_close"), image_size=(48, 64))
+    observation, _ = env.reset(seed=0)
+    assert set(observation) == {"state", "images/top", "images/front_close"}
+    for key in ("images/top", "images/front_close"):
+        assert observation[key].shape == (48, 64, 3)
+        assert observation[key].dtype == np.uint8
+        assert observation[key].std() > 10  # something is to be seen
+    moved, *_ = env.step(env.action_space.high)
+    assert not np.shares_memory(observation["images/top"], moved["images/top"])
+    env.close()
+
+
+@pytest.mark.gl
+@pytest.mark.filterwarnings(ADVICE)
+def test_check_env_with_cameras_and_rendering(name: str) -> None:
+    env = make_env(name, cameras=("top",), image_size=(24, 32), render_mode="rgb_array")
+    check_env(env.unwrapped, skip_render_check=True)
+    frame = env.unwrapped.render()
+    assert frame.shape == (24, 32, 3)
+    env.close()

@@ -1,0 +1,174 @@
+"""The motion library and the segments drawn from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from robo_manip_baselines.envs.mujoco.motion import MotionLibrary, MotionSegment
+from robo_manip_baselines.errors import RequestError
+
+FPS = 30.0
+
+
+def content(lengths: tuple[int, ...] = (500, 360, 420)) -> dict[str, Any]:
+    """A library of runs that move in ways a test can tell apart."""
+    frames = np.concatenate([np.arange(length) for length in lengths])
+    angle = 0.001 * frames
+    quaternion = Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0]).as_quat(scalar_first=True)
+    return {
+        "schema": np.array("recorded_face_motion"),
+        "version": np.array(1),
+        "fps": np.array(FPS),
+        "time": (frames / FPS).astype(np.float32),
+        "mouth": np.stack([1e-4 * frames, 2e-4 * frames, -0.5 + 3e-4 * frames], -1).astype("f4"),
+        "orientation": quaternion.astype(np.float32),
+        "jaw": (1e-5 * frames).astype(np.float32),
+        "run_start": np.cumsum([0, *lengths[:-1]]),
+        "run_length": np.array(lengths),
+        "run_clip": np.array([f"clip{i}" for i in range(len(lengths))]),
+        "run_subject": np.array([f"subject{i}" for i in range(len(lengths))]),
+        "metadata": np.array("{}"),
+    }
+
+
+def save(folder: Path, **changes: Any) -> Path:
+    path = folder / "library.npz"
+    values = {**content(), **changes}
+    np.savez(path, **{name: value for name, value in values.items() if value is not None})
+    return path
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> MotionLibrary:
+    return MotionLibrary.load(save(tmp_path))
+
+
+def test_segment_maps_the_cameras_axes_to_the_worlds(library: MotionLibrary) -> None:
+    segment = library.segment(0, 100)
+    displacement, _, _ = segment.at(1.0)
+    # In 30 frames: camera x +3 mm, y +6 mm, z +9 mm; world x is camera z, y is x, z is y.
+    np.testing.assert_allclose(displacement, [9e-3, 3e-3, 6e-3], atol=1e-7)  # float32 storage
+
+
+def test_segment_starts_without_displacement_and_follows_the_recording(
+    library: MotionLibrary,
+) -> None:
+    segment = library.segment(2, 17)
+    first = int(library.run_start[2]) + 17
+    moved = library.mouth[first : first + 361] - library.mouth[first]
+    displacement, orientation, jaw = segment.at(np.arange(361) / FPS)
+    np.testing.assert_allclose(displacement, moved[:, [2, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(jaw, library.jaw[first : first + 361], atol=1e-12)
+    alike = np.abs((orientation * library.orientation[first : first + 361]).sum(axis=1))
+    np.testing.assert_allclose(alike, 1.0, atol=1e-6)
+
+
+@given(st.floats(min_value=-1.0, max_value=20.0))
+def test_interpolation_is_the_obvious_one(time: float) -> None:
+    rng = np.random.default_rng(0)
+    frames = 40
+    rotations = Rotation.random(1, rng=rng) * Rotation.from_rotvec(
+        0.05 * rng.standard_normal((frames, 3))
+    )
+    segment = MotionSegment(
+        fps=FPS,
+        displacement=rng.standard_normal((frames, 3)),
+        orientation=rotations.as_quat(scalar_first=True),
+        jaw=rng.random(frames),
+        clip="",
+        subject="",
+        start=0,
+        index=0,
+    )
+    displacement, orientation, jaw = segment.at(time)
+    position = min(max(time * FPS, 0.0), frames - 1.0)
+    low = min(int(position), frames - 2)
+    share = position - low
+    between = (1 - share) * segment.displacement[low] + share * segment.displacement[low + 1]
+    np.testing.assert_allclose(displacement, between, atol=1e-9)
+    np.testing.assert_allclose(
+        jaw, (1 - share) * segment.jaw[low] + share * segment.jaw[low + 1], atol=1e-9
+    )
+    step = (rotations[low].inv() * rotations[low + 1]).as_rotvec()
+    expected = rotations[low] * Rotation.from_rotvec(share * step)
+    difference = expected.inv() * Rotation.from_quat(orientation, scalar_first=True)
+    assert difference.magnitude() < 1e-7  # rad
+
+
+def test_starts_are_uniform_over_every_frame_that_leaves_twelve_seconds(
+    library: MotionLibrary,
+) -> None:
+    # 500 and 420 frames leave 140 and 60 starts; 360 frames are 11.97 s and leave none.
+    assert library.starts().tolist() == [140, 0, 60]
+    rng = np.random.default_rng(1)
+    drawn = [library.draw(rng) for _ in range(4000)]
+    share = np.mean([segment.clip == "clip0" for segment in drawn])
+    # Four standard deviations of a binomial share of 0.7 in 4000 draws.
+    assert abs(share - 0.7) < 4 * np.sqrt(0.7 * 0.3 / 4000)
+    assert {s.start for s in drawn if s.clip == "clip0"} == set(range(140))
+    assert {s.start for s in drawn if s.clip == "clip2"} == set(range(60))
+    assert all(len(segment.jaw) >= 361 for segment in drawn)
+
+
+def test_clips_restrict_the_draw(library: MotionLibrary) -> None:
+    rng = np.random.default_rng(0)
+    assert {library.draw(rng, clips=["clip2"]).clip for _ in range(20)} == {"clip2"}
+    with pytest.raises(RequestError, match="unknown clip 'clip9'.*valid: clip0, clip1, clip2"):
+        library.draw(rng, clips=["clip9"])
+    with pytest.raises(RequestError, match="no run .* lasts 12 s in clips clip1"):
+        library.draw(rng, clips=["clip1"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema": np.array("other")}, "schema is 'other'"),
+        ({"schema": None}, "schema is 'None'"),
+        ({"version": np.array(2)}, "version is 2"),
+        ({"version": np.array("one")}, "version is one"),
+        ({"fps": np.array(0.0)}, "'fps'"),
+        ({"fps": np.array([30.0, 30.0])}, "'fps'"),
+        ({"jaw": None}, "'jaw' is missing"),
+        ({"metadata": np.array("{")}, "'metadata'"),
+        ({"mouth": np.zeros((1280, 2), "f4")}, "'mouth' and 'orientation'"),
+        ({"mouth": np.zeros(1280, "f4")}, "'mouth' has shape"),
+        ({"mouth": np.full((1280, 3), np.nan, "f4")}, "'mouth' holds values"),
+        ({"orientation": np.full((1280, 4), 0.4, "f4")}, "not of unit length"),
+        ({"jaw": np.zeros(7, "f4")}, "'jaw'"),
+        ({"run_clip": np.array(["a"])}, "run_\\* arrays differ"),
+        ({"run_start": np.array([0, 500, 1000])}, "outside the frames"),
+        ({"run_length": np.array([500, 360, 0])}, "outside the frames"),
+    ],
+)
+def test_damaged_libraries_are_refused_by_name(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    path = save(tmp_path, **changes)
+    with pytest.raises(RequestError, match=f"library.npz' is damaged: .*{message}") as caught:
+        MotionLibrary.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_truncated_and_missing_files_are_refused_by_name(tmp_path: Path) -> None:
+    path = save(tmp_path)
+    whole = path.read_bytes()
+    for length in (0, 10, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(RequestError, match="library.npz' cannot be read"):
+            MotionLibrary.load(path)
+    with pytest.raises(RequestError, match="nowhere.npz' does not exist"):
+        MotionLibrary.load(tmp_path / "nowhere.npz")
+
+
+def test_pickles_are_never_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "library.npz"
+    np.savez(path, **{**content(), "jaw": np.array([{}], dtype=object)})
+    with pytest.raises(RequestError, match="cannot be read"):
+        MotionLibrary.load(path)

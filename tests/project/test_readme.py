@@ -1,0 +1,141 @@
+"""What README.md and docs/ say is true: commands, options, paths, links, and the Python in them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`([^`\n]+)`")
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
+COMMAND = re.compile(r"(python bin/|face-prediction |make )\S+")
+
+
+@pytest.fixture(scope="module")
+def readme(repository: Path) -> str:
+    return (repository / "README.md").read_text(encoding="utf-8")
+
+
+def fenced(text: str, language: str) -> list[str]:
+    return [body for name, body in FENCE.findall(text) if name == language]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Return the words of every command in a bash block or between backticks."""
+    lines = [line for block in fenced(text, "bash") for line in block.splitlines()]
+    prose = FENCE.sub("", text)
+    lines += [code for code in INLINE.findall(prose) if COMMAND.match(code)]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def run(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
+    return subprocess.run(
+        words, cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_readme_names_the_commands_of_the_data_flow(readme: str) -> None:
+    said = {" ".join(words[:3]) for words in commands(readme)}
+    for start in (
+        "make demo",
+        "make test",
+        "make wheelhouse PYTHON=3.12",
+        "face-prediction extract clips/*.mp4",
+        "python bin/Rollout.py FeedingEnv",
+        "python bin/Dataset.py verify",
+    ):
+        assert start in said
+
+
+def test_make_targets_exist(readme: str, repository: Path) -> None:
+    targets = {words[1] for words in commands(readme) if words[0] == "make" and len(words) > 1}
+    assert {"demo", "test", "check", "test-fast", "wheelhouse"} <= targets
+    for target in sorted(targets):
+        result = run("make", "--dry-run", target, cwd=repository)
+        assert result.returncode == 0, result.stderr
+
+
+def test_every_option_of_a_command_is_in_its_help(readme: str, repository: Path) -> None:
+    checked = 0
+    for words in commands(readme):
+        if words[0] == "python" and len(words) > 1:
+            program = [words[1]]
+            arguments = words[2:]
+        elif words[0] == "face-prediction":
+            program = ["-m", "face_prediction"]
+            arguments = words[1:]
+        else:
+            continue
+        subcommand = arguments[:1] if "Rollout" not in words[1] and "Replay" not in words[1] else []
+        result = run(sys.executable, *program, *subcommand, "--help", cwd=repository)
+        assert result.returncode == 0, (words, result.stderr)
+        for option in (word for word in arguments if word.startswith("--")):
+            assert re.search(rf"{option}\b", result.stdout), (words, option)
+        checked += 1
+    assert checked >= 6
+
+
+@pytest.mark.gl
+def test_python_in_the_readme_runs(readme: str, repository: Path, tmp_path: Path) -> None:
+    snippets = fenced(readme, "python")
+    assert len(snippets) >= 2
+    for number, snippet in enumerate(snippets):
+        script = tmp_path / f"snippet_{number}.py"
+        script.write_text(snippet, encoding="utf-8")
+        result = run(sys.executable, "-W", "error", str(script), cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+        assert result.stdout.strip()
+
+
+def documents(project_files: list[Path]) -> list[Path]:
+    return [f for f in project_files if f.suffix == ".md"]
+
+
+def test_links_lead_somewhere(repository: Path, project_files: list[Path]) -> None:
+    broken = [
+        f"{page}: {target}"
+        for page in documents(project_files)
+        for target in LINK.findall((repository / page).read_text(encoding="utf-8"))
+        if not target.startswith(("http:", "https:"))
+        and not (repository / page.parent / target).exists()
+    ]
+    assert broken == []
+
+
+def test_paths_in_backticks_exist(repository: Path, project_files: list[Path]) -> None:
+    """Whatever a page writes as a path below a folder of the repository is there."""
+    ours = re.compile(r"^(?:robo_manip_baselines|face_prediction|tests|docs|bin|benchmarks|\.ci)/")
+    missing = [
+        f"{page}: {code}"
+        for page in documents(project_files)
+        for code in INLINE.findall(FENCE.sub("", (repository / page).read_text(encoding="utf-8")))
+        if re.fullmatch(r"[\w./-]+\.\w+", code)
+        and ours.match(code)
+        and not (repository / code).exists()
+    ]
+    assert missing == []
+
+
+def test_every_page_is_in_the_index(repository: Path, project_files: list[Path]) -> None:
+    for folder in (Path("docs"), Path("docs/decisions")):
+        index = (repository / folder / "README.md").read_text(encoding="utf-8")
+        linked = {(folder / target).as_posix() for target in LINK.findall(index)}
+        pages = {f.as_posix() for f in documents(project_files) if f.parent == folder}
+        assert pages - {(folder / "README.md").as_posix()} <= linked
+
+
+def test_pictures_are_shown_somewhere(repository: Path, project_files: list[Path]) -> None:
+    shown = {
+        os.path.normpath(page.parent / target)
+        for page in documents(project_files)
+        for target in LINK.findall((repository / page).read_text(encoding="utf-8"))
+    }
+    pictures = {str(f) for f in project_files if f.parts[0] == "docs" and f.suffix == ".png"}
+    assert pictures <= shown
