@@ -51,7 +51,7 @@ class ExtractSettings:
         if not 0.0 <= self.max_gap <= 1.0:
             raise RequestError(f"--max_gap {self.max_gap}: between 0 and 1 s")
         if self.zoom and self.detector.running_mode == "video":
-            raise RequestError("--zoom works with --running_mode image only; add --zoom False")
+            raise RequestError("--zoom works with --running_mode image only; add --no_zoom")
 
 
 class ProgressFactory(Protocol):
@@ -59,7 +59,9 @@ class ProgressFactory(Protocol):
 
     def __call__(
         self, frames: Iterable[VideoFrame], total: int | None, name: str
-    ) -> Iterable[VideoFrame]: ...
+    ) -> Iterable[VideoFrame]:
+        """Pass on every one of ``frames``, of which ``total`` are expected."""
+        ...
 
 
 def no_progress(frames: Iterable[VideoFrame], total: int | None, name: str) -> Iterable[VideoFrame]:

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 from tqdm import tqdm
@@ -52,9 +51,9 @@ class ExtractOptions:
     #: Least score of the landmark network's "a face is present".
     min_presence_confidence: float = 0.5
     #: Look at small faces through a still window three faces wide (with image only).
-    zoom: Annotated[bool, tyro.conf.FlagConversionOff] = True
+    zoom: bool = True
     #: Show a progress bar for every video.
-    progress: Annotated[bool, tyro.conf.FlagConversionOff] = True
+    progress: bool = True
 
 
 def run_extract(options: ExtractOptions) -> int:

@@ -44,15 +44,23 @@ def read_canonical_face(model: Path) -> CanonicalFace:
             fields = _fields(archive.read(GEOMETRY_FILE))
         # GeometryPipelineMetadata: 1 canonical_mesh, 2 procrustes_landmark_basis (id, weight);
         # Mesh3d: 3 vertex_buffer
-        mesh = _fields(next(value for key, value in fields if key == 1))
-        floats = [struct.unpack("<f", value)[0] for key, value in mesh if key == 3]
+        mesh = _fields(_bytes(next(value for key, value in fields if key == 1)))
+        floats = [struct.unpack("<f", _bytes(value))[0] for key, value in mesh if key == 3]
         vertices = np.array(floats).reshape(-1, _VERTEX_FLOATS)[:, :3] * CENTIMETRE
         weights = np.zeros(len(vertices))
         for key, value in fields:
             if key == 2:
-                basis = dict(_fields(value))
-                weights[basis[1]] = struct.unpack("<f", basis[2])[0]
-    except (zipfile.BadZipFile, KeyError, OSError, StopIteration, ValueError, IndexError) as error:
+                basis = dict(_fields(_bytes(value)))
+                weights[int(basis[1])] = struct.unpack("<f", _bytes(basis[2]))[0]
+    except (
+        zipfile.BadZipFile,
+        KeyError,
+        OSError,
+        StopIteration,
+        ValueError,
+        IndexError,
+        struct.error,
+    ) as error:
         raise RequestError(
             f"{model}: not a face landmarker model ({type(error).__name__}: {error})"
         ) from None
@@ -70,8 +78,8 @@ def head_pose_from_landmarks(
     width, height = image_size
     half_height = np.tan(np.radians(VERTICAL_FOV_DEGREES) / 2)
     half_width = half_height * width / height
-    flat = np.asarray(landmarks, dtype=float) * (2 * half_width, -2 * half_height, 2 * half_width)
-    flat = flat + (-half_width, half_height, 0.0)  # on the plane one unit ahead; z away from us
+    flat = np.asarray(landmarks, dtype=float) - (0.5, 0.5, 0.0)
+    flat = flat * (2 * half_width, -2 * half_height, 2 * half_width)  # one unit ahead, z away
     middle = flat[:, 2].mean()
 
     first = _fit(face, flat * (1, 1, -1))[0]
@@ -123,6 +131,12 @@ def _fields(data: bytes) -> list[tuple[int, bytes | int]]:
             value, at = data[at : at + size], at + size
         fields.append((key >> 3, value))
     return fields
+
+
+def _bytes(value: bytes | int) -> bytes:
+    if isinstance(value, int):
+        raise ValueError("a number where a message was expected")
+    return value
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:

@@ -16,11 +16,13 @@ import numpy as np
 VERTICAL_FOV_DEGREES = 63.0
 
 #: The 40 points of MediaPipe's FACEMESH_LIPS; their mean is the mouth centre (paper, IV.B).
+# fmt: off
 LIPS = (
-    (0, 13, 14, 17, 37, 39, 40, 61, 78, 80, 81, 82, 84, 87, 88, 91, 95, 146, 178, 181)
-    + (185, 191, 267, 269, 270, 291, 308, 310, 311, 312, 314, 317, 318, 321, 324, 375, 402)
-    + (405, 409, 415)
-)  # fmt: skip
+    0, 13, 14, 17, 37, 39, 40, 61, 78, 80, 81, 82, 84, 87, 88, 91, 95, 146, 178, 181,
+    185, 191, 267, 269, 270, 291, 308, 310, 311, 312, 314, 317, 318, 321, 324, 375, 402, 405, 409,
+    415,
+)
+# fmt: on
 UPPER_INNER_LIP = 13
 LOWER_INNER_LIP = 14
 
@@ -83,7 +85,7 @@ def mouth_centres(
 def jaw_openings(
     landmarks: np.ndarray, head_pose: np.ndarray, image_size: tuple[int, int]
 ) -> np.ndarray:
-    """Distances (T,) in metres between the inner lips (landmarks 13 and 14) on the mouth's plane."""
+    """Distances (T,) in metres between the inner lips (13 and 14) on the mouth's plane."""
     pair = points_on_mouth_plane(
         landmarks[:, [UPPER_INNER_LIP, LOWER_INNER_LIP]], head_pose, image_size
     )

@@ -51,9 +51,9 @@ def find_model(given: Path | None, url: str = MODEL_URL, expected: str = MODEL_S
 
 
 def _download(url: str, path: Path, expected: str) -> None:
-    logger.info("downloading %s to %s", url, path)
     try:
         with urllib.request.urlopen(url, timeout=TIMEOUT_S) as response:
+            logger.info("downloading %s to %s", url, path)
             data = response.read()
     except (urllib.error.URLError, OSError) as error:
         reason = getattr(error, "reason", error)
@@ -69,7 +69,7 @@ def _download(url: str, path: Path, expected: str) -> None:
         handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)
-        os.replace(name, path)
+        Path(name).replace(path)
     except OSError as error:
         raise RequestError(
             f"{path}: cannot be written ({error.strerror}); name a model with --model"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -14,13 +13,13 @@ import tyro
 
 from face_prediction.attribution import Attribution, read_attributions
 from face_prediction.errors import RequestError
-from face_prediction.library import SCHEMA, MotionLibrary, build_library, save_library
+from face_prediction.library import SCHEMA, VERSION, MotionLibrary, build_library, save_library
 from face_prediction.lifting import VERTICAL_FOV_DEGREES
 from face_prediction.motion import ClipMotion, MotionSettings, lift
 from face_prediction.npz_file import read_npz
 from face_prediction.quality import QualityLimits
 from face_prediction.report import clip_row, write_report
-from face_prediction.tracks import FaceTrack, load_track
+from face_prediction.tracks import load_track
 
 logger = logging.getLogger(__name__)
 
@@ -42,8 +41,7 @@ class ExportMotionOptions:
     Only clips whose row says ship=yes are taken. Without --attribution every clip is taken, each
     as a subject of its own, and the library says that nothing is known of its licence.
 
-    Example: face-prediction export-motion face_tracks --attribution clips.csv \
-        --out face_motion.npz --report docs/face_motion.md
+    Example: face-prediction export-motion face_tracks --attribution clips.csv --out motion.npz
     """
 
     #: Folders of tracks, or single tracks.
@@ -107,7 +105,7 @@ def run_export_motion(options: ExportMotionOptions) -> int:
             continue
         track = load_track(path)
         clips.append((attribution.clip, attribution, lift(track, settings)))
-        detectors.append(detector_record(track))
+        detectors.append(dict(track.detector))
     metadata = describe(clips, settings, detectors, withheld)
     library = build_library([(name, row.subject, motion) for name, row, motion in clips], metadata)
     save_library(options.out, library)
@@ -169,7 +167,7 @@ def refuse_other_files(out: Path) -> None:
         raise RequestError(f"--out {out}: is a folder; name a file")
     if out.exists():
         try:
-            read_npz(out, SCHEMA, 1)
+            read_npz(out, SCHEMA, VERSION)
         except RequestError as error:
             raise RequestError(f"{error}; it is in the way of --out, so remove it first") from None
 
@@ -190,17 +188,8 @@ def describe(
         "attribution": {name: row.record() for name, row, _ in used},
         "clips": {name: clip_row(motion, row.subject) for name, row, motion in clips},
         "withheld_clips": withheld,
-        "versions": {
-            name: importlib.metadata.version(name)
-            for name in ("numpy", "robo_manip_baselines")
-            if _installed(name)
-        },
+        "versions": {"numpy": np.__version__, "library_schema": VERSION},
     }
-
-
-def detector_record(track: FaceTrack) -> dict[str, Any]:
-    """The detector as recorded in a track, for the library."""
-    return {key: value for key, value in track.detector.items() if key != "zoom"}
 
 
 def summary(library: MotionLibrary) -> str:
@@ -211,11 +200,3 @@ def summary(library: MotionLibrary) -> str:
         f"{library.seconds:.1f} s in {len(library.run_start)} runs of {subjects} subjects, "
         f"the shortest {shortest:.1f} s"
     )
-
-
-def _installed(name: str) -> bool:
-    try:
-        importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True

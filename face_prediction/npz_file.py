@@ -36,7 +36,7 @@ def write_npz(path: Path, arrays: Arrays) -> None:
         with os.fdopen(handle, "wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, **arrays)
         temporary.chmod(0o644)  # mkstemp makes files that only their owner may read
-        os.replace(temporary, path)
+        temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -51,8 +51,11 @@ def read_npz(path: Path, schema: str, version: int) -> Arrays:
     if not path.is_file():
         raise RequestError(f"{path}: no such file; expected a '{schema}' .npz")
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
+        # opened and looked at here, because NumPy leaves a damaged file open
+        with path.open("rb") as stream, zipfile.ZipFile(stream):
+            stream.seek(0)
+            with np.load(stream, allow_pickle=False) as stored:
+                arrays = {key: stored[key] for key in stored.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as error:
         raise RequestError(
             f"{path}: damaged or not an .npz file ({type(error).__name__}: {error}); make it again"

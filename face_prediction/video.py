@@ -71,14 +71,15 @@ class VideoReader:
 
     def __init__(self, path: Path) -> None:
         import av
+        from av.error import FFmpegError
 
         require_video(path)
         self._path = path
         try:
             self._container = av.open(str(path))
-        except (av.FFmpegError, OSError) as error:
+        except (FFmpegError, OSError) as error:
             raise RequestError(
-                f"{path}: cannot be opened as a video ({error}); truncated, or not a video"
+                f"{path}: cannot be opened as a video ({error.strerror}); truncated, or not a video"
             ) from None
         if not self._container.streams.video:
             self._container.close()
@@ -100,7 +101,7 @@ class VideoReader:
         Raises:
             RequestError: the file breaks off before its end.
         """
-        import av
+        from av.error import FFmpegError
 
         count = 0
         last = -np.inf
@@ -117,9 +118,10 @@ class VideoReader:
                     last = frame.time
                     image = frame.to_ndarray(format="rgb24")
                     yield VideoFrame(last, upright(image, frame.rotation))
-        except av.FFmpegError as error:
+        except FFmpegError as error:
             raise RequestError(
-                f"{self._path}: breaks off after {count} frames ({error}); truncated or damaged"
+                f"{self._path}: breaks off after {count} frames ({error.strerror}); "
+                "truncated or damaged"
             ) from None
         expected = self.info.expected_frames
         if count < WHOLE_SHARE * expected:

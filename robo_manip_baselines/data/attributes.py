@@ -8,21 +8,22 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import h5py
 import numpy as np
 
 from robo_manip_baselines.data.schema import ATTRIBUTES, FIELDS, Attribute
 
 
 def stored_attribute(item: Attribute, value: Any) -> Any:
-    """Turn a value into what HDF5 keeps: text, int64, float64, bool or a float64 vector.
+    """Turn a value into what HDF5 keeps: UTF-8, int64, float64, bool or a float64 vector.
 
     Raises:
         ValueError: if the value is not of the attribute's kind.
     """
     if item.kind == "json":
-        return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False)
+        return stored_text(json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False))
     if item.kind == "text" and isinstance(value, str):
-        return value
+        return stored_text(value)
     if item.kind == "bool" and isinstance(value, bool | np.bool_):
         return np.bool_(value)
     if item.kind == "int" and isinstance(value, int | np.integer) and not isinstance(value, bool):
@@ -37,6 +38,14 @@ def stored_attribute(item: Attribute, value: Any) -> Any:
     raise ValueError(f"attribute '{item.name}' needs {item.kind}, not {value!r}")
 
 
+def stored_text(text: str) -> np.ndarray:
+    """A string as HDF5 keeps it: UTF-8 of fixed length, which lies under the file's checksums."""
+    data = text.encode()
+    if b"\0" in data:
+        raise ValueError(f"text with a null character: {text!r}")
+    return np.array(data, dtype=h5py.string_dtype("utf-8", max(len(data), 1)))
+
+
 def loaded_attribute(item: Attribute, value: Any) -> Any:
     """Undo `stored_attribute`: plain Python values, JSON parsed, vectors as float64 arrays.
 
@@ -47,8 +56,10 @@ def loaded_attribute(item: Attribute, value: Any) -> Any:
         if isinstance(value, np.ndarray) and value.shape == (item.length,):
             return value.astype(np.float64)
     elif item.kind in ("text", "json"):
-        if isinstance(value, str):
-            return value if item.kind == "text" else json.loads(value)
+        value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+        if isinstance(value, bytes | str):
+            text = value.decode() if isinstance(value, bytes) else value
+            return text if item.kind == "text" else json.loads(text)
     elif isinstance(value, np.generic):
         kinds = {"bool": "b", "int": "i", "float": "f"}
         if value.dtype.kind == kinds[item.kind]:

@@ -13,7 +13,6 @@ from robo_manip_baselines.data.attributes import loaded_attribute
 from robo_manip_baselines.data.images import decode_image, image_checksum
 from robo_manip_baselines.data.schema import (
     ATTRIBUTES,
-    CHECKSUM_GROUP,
     FIELD_BY_NAME,
     FIELDS,
     IMAGE_GROUP,
@@ -21,6 +20,9 @@ from robo_manip_baselines.data.schema import (
     SCHEMA_VERSION,
 )
 from robo_manip_baselines.errors import RequestError, require_choice
+
+# Whatever HDF5 and h5py raise on damaged bytes.
+READ_ERRORS = (KeyError, ValueError, OSError, RuntimeError, TypeError, OverflowError, MemoryError)
 
 
 class EpisodeFileError(RequestError):
@@ -53,7 +55,7 @@ class EpisodeReader:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._checksums: dict[str, np.ndarray] = {}
+        self._frames: dict[str, FrameStore] = {}
         self._file = open_hdf5(self.path)
         try:
             require_schema(self.path, self._file)
@@ -61,7 +63,7 @@ class EpisodeReader:
                 item.name: loaded_attribute(item, self._file.attrs[item.name])
                 for item in ATTRIBUTES
             }
-        except (KeyError, ValueError, OSError, RuntimeError) as error:
+        except READ_ERRORS as error:
             self._file.close()
             if isinstance(error, EpisodeFileError):
                 raise
@@ -99,7 +101,12 @@ class EpisodeReader:
             EpisodeFileError: if it is missing or damaged.
         """
         require_choice("field", name, FIELD_BY_NAME)
-        return self._read(name, slice(None))
+        try:
+            return np.asarray(dataset_of(self._file, name)[()])
+        except READ_ERRORS as error:
+            raise EpisodeFileError(
+                f"'{self.path}': '{name}' cannot be read: {one_line(error)}"
+            ) from error
 
     def encoded_frame(self, camera: str, step: int) -> np.ndarray:
         """The bytes of one picture, (N,) uint8; with the codec ``raw`` the (H, W, 3) image.
@@ -111,12 +118,14 @@ class EpisodeReader:
         require_choice("camera", camera, self.cameras)
         if not 0 <= step < len(self):
             raise RequestError(f"'{self.path}' has steps 0…{len(self) - 1}, not {step}")
-        if camera not in self._checksums:
-            self._checksums[camera] = self._read(f"{CHECKSUM_GROUP}/{camera}", slice(None))
-        data = self._read(f"{IMAGE_GROUP}/{camera}", step)
-        if image_checksum(data) != int(self._checksums[camera][step]):
-            raise EpisodeFileError(f"'{self.path}': frame {step} of '{camera}' is damaged")
-        return data
+        try:
+            if camera not in self._frames:
+                self._frames[camera] = FrameStore(self._file, camera, len(self))
+            return self._frames[camera].encoded(step)
+        except READ_ERRORS as error:
+            raise EpisodeFileError(
+                f"'{self.path}': frame {step} of '{camera}' cannot be read: {one_line(error)}"
+            ) from error
 
     def frame(self, camera: str, step: int) -> np.ndarray:
         """One picture, (H, W, 3) uint8 RGB. Raises as `encoded_frame` does."""
@@ -125,18 +134,41 @@ class EpisodeReader:
             return decode_image(data)
         except ValueError as error:
             raise EpisodeFileError(
-                f"'{self.path}': frame {step} of '{camera}' is {one_line(error)}"
+                f"'{self.path}': frame {step} of '{camera}': {one_line(error)}"
             ) from error
 
     def close(self) -> None:
         """Close the file; may be called again."""
         self._file.close()
 
-    def _read(self, name: str, index: slice | int) -> np.ndarray:
-        try:
-            return np.asarray(dataset_of(self._file, name)[index])
-        except (KeyError, IndexError, OSError, RuntimeError, ValueError, TypeError) as error:
-            raise EpisodeFileError(f"'{self.path}': '{name}' {one_line(error)}") from error
+
+class FrameStore:
+    """The encoded pictures of one camera in an open file.
+
+    Raises:
+        KeyError, ValueError, OSError: see `READ_ERRORS`; if something is missing or damaged.
+    """
+
+    def __init__(self, file: h5py.File, camera: str, num_steps: int) -> None:
+        group = f"{IMAGE_GROUP}/{camera}"
+        self._data = dataset_of(file, f"{group}/data")
+        self.checksum: np.ndarray = dataset_of(file, f"{group}/checksum")[()]
+        self._offset: np.ndarray | None = None
+        if self._data.ndim == 1:
+            self._offset = dataset_of(file, f"{group}/offset")[()]
+        frames = len(self._data) if self._offset is None else len(self._offset) - 1
+        if frames != num_steps or self.checksum.shape != (num_steps,):
+            raise ValueError(f"{frames} frames instead of {num_steps}")
+
+    def encoded(self, step: int) -> np.ndarray:
+        """One picture as it was given to the writer; raises if it is not that any more."""
+        if self._offset is None:
+            data = np.asarray(self._data[step])
+        else:
+            data = np.asarray(self._data[int(self._offset[step]) : int(self._offset[step + 1])])
+        if image_checksum(data) != int(self.checksum[step]):
+            raise ValueError("its checksum is wrong")
+        return data
 
 
 def open_hdf5(path: Path) -> h5py.File:
@@ -160,6 +192,7 @@ def open_hdf5(path: Path) -> h5py.File:
 def require_schema(path: Path, file: h5py.File) -> None:
     """Raise `EpisodeFileError` unless this is an episode of the version that this code reads."""
     schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")
+    schema = schema.decode(errors="replace") if isinstance(schema, bytes) else schema
     if schema != SCHEMA:
         raise EpisodeFileError(f"'{path}' is no episode: schema {schema!r}, not '{SCHEMA}'")
     if version != SCHEMA_VERSION:
@@ -172,11 +205,13 @@ def dataset_of(file: h5py.File, name: str) -> h5py.Dataset:
     """The dataset of that name; raises KeyError if there is none."""
     dataset = file.get(name)
     if not isinstance(dataset, h5py.Dataset):
-        raise KeyError("is missing" if dataset is None else "is no dataset")
+        raise KeyError(f"no dataset '{name}'")
     return dataset
 
 
 def one_line(error: BaseException) -> str:
     """The message of an exception as one line."""
     message = error.args[0] if isinstance(error, KeyError) and error.args else error
+    if "filter returned failure" in str(message):  # HDF5's words for it
+        return "its checksum is wrong"
     return " ".join(str(message).split())

@@ -14,13 +14,13 @@ from robo_manip_baselines.data.attributes import (
     episode_consistency,
     loaded_attribute,
     stored_attribute,
+    stored_text,
 )
 from robo_manip_baselines.data.checks import shape_problems, value_problems
 from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.data.images import CODECS, decode_image, image_checksum
 from robo_manip_baselines.data.schema import (
     ATTRIBUTES,
-    CHECKSUM_GROUP,
     FIELD_BY_NAME,
     FIELDS,
     IMAGE_GROUP,
@@ -31,6 +31,9 @@ from robo_manip_baselines.errors import require_choice
 
 # From this release of the file format on, HDF5 keeps checksums of its own structure.
 _HDF5_FORMAT = ("v110", "v110")
+
+# Of pictures one after another: about one JPEG of 480 x 640, so that one frame reads one or two.
+_CHUNK_BYTES = 65536
 
 EncodedImages = Mapping[str, Sequence[np.ndarray]]
 
@@ -72,7 +75,7 @@ def write_episode(
     )
     if problems:
         raise ValueError(f"episode for '{path}': {'; '.join(problems)}")
-    stored["content_sha256"] = content_digest(fields, checksums, loaded)
+    stored["content_sha256"] = stored_text(content_digest(fields, checksums, loaded))
     with (
         atomic_file(path) as temporary,
         h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file,
@@ -81,12 +84,11 @@ def write_episode(
             file.attrs[item.name] = stored[item.name]
         for field in FIELDS:
             _write_array(file, field.name, fields[field.name])
-            file[field.name].attrs.update(
-                {"unit": field.unit, "frame": field.frame, "description": field.description}
-            )
+            for name in ("unit", "frame", "description"):
+                file[field.name].attrs[name] = stored_text(getattr(field, name))
         for camera, frames in sorted(images.items()):
             _write_frames(file, f"{IMAGE_GROUP}/{camera}", frames)
-            _write_array(file, f"{CHECKSUM_GROUP}/{camera}", checksums[camera])
+            _write_array(file, f"{IMAGE_GROUP}/{camera}/checksum", checksums[camera])
     return path
 
 
@@ -168,20 +170,18 @@ def _write_array(file: h5py.File, name: str, values: np.ndarray) -> None:
 
 
 def _write_frames(file: h5py.File, name: str, frames: Sequence[np.ndarray]) -> None:
-    """One row a frame: bytes of varying length, or for raw images an (H, W, 3) chunk."""
+    """Raw images as (T, H, W, 3), a chunk each; others as bytes one after another."""
     if frames[0].ndim == 1:
-        dataset = file.create_dataset(
-            name, (len(frames),), h5py.vlen_dtype(np.uint8), track_times=False
-        )
+        sizes = [frame.size for frame in frames]
+        _write_array(file, f"{name}/offset", np.cumsum([0, *sizes], dtype=np.int64))
+        shape, chunks = (sum(sizes),), (min(sum(sizes), _CHUNK_BYTES),)
     else:
-        shape = frames[0].shape
-        dataset = file.create_dataset(
-            name,
-            (len(frames), *shape),
-            np.uint8,
-            chunks=(1, *shape),
-            fletcher32=True,
-            track_times=False,
-        )
-    for step, frame in enumerate(frames):
-        dataset[step] = frame
+        shape, chunks = (len(frames), *frames[0].shape), (1, *frames[0].shape)
+    dataset = file.create_dataset(
+        f"{name}/data", shape, np.uint8, chunks=chunks, fletcher32=True, track_times=False
+    )
+    if frames[0].ndim == 1:
+        dataset[:] = np.concatenate(frames)
+    else:
+        for step, frame in enumerate(frames):
+            dataset[step] = frame

@@ -17,24 +17,21 @@ from robo_manip_baselines.data.attributes import (
 )
 from robo_manip_baselines.data.checks import shape_problems, value_problems
 from robo_manip_baselines.data.episode import (
+    READ_ERRORS,
     EpisodeFileError,
-    dataset_of,
+    FrameStore,
     one_line,
     open_hdf5,
     require_schema,
 )
-from robo_manip_baselines.data.images import decode_image, image_checksum
+from robo_manip_baselines.data.images import decode_image
 from robo_manip_baselines.data.schema import (
     ATTRIBUTE_BY_NAME,
     ATTRIBUTES,
-    CHECKSUM_GROUP,
     FIELD_BY_NAME,
     FIELDS,
     IMAGE_GROUP,
 )
-
-# Whatever HDF5 and h5py raise on damaged bytes.
-READ_ERRORS = (KeyError, ValueError, OSError, RuntimeError, TypeError, OverflowError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -84,10 +81,13 @@ def _file_problems(path: Path, file: h5py.File, images: bool) -> list[Problem]:
     checksums: dict[str, np.ndarray] = {}
     for camera in _names(attributes.get("cameras")):
         try:
-            checksums[camera] = dataset_of(file, f"{CHECKSUM_GROUP}/{camera}")[()]
-            messages += _image_problems(file, camera, checksums[camera], attributes, images)
+            frames = FrameStore(file, camera, attributes.get("num_steps", 0))
         except READ_ERRORS as error:
-            messages.append(f"images of '{camera}' cannot be read: {one_line(error)}")
+            messages.append(f"'{IMAGE_GROUP}/{camera}' cannot be read: {one_line(error)}")
+            continue
+        checksums[camera] = frames.checksum
+        if images:
+            messages += _image_problems(frames, camera, attributes)
     if not messages and (
         content_digest(arrays, checksums, attributes) != attributes["content_sha256"]
     ):
@@ -128,37 +128,27 @@ def _arrays(file: h5py.File) -> tuple[dict[str, np.ndarray], list[str]]:
             except READ_ERRORS as error:
                 problems.append(f"'{field.name}' cannot be read: {one_line(error)}")
                 continue
-            if dataset.attrs.get("unit") != field.unit:
-                unit = dataset.attrs.get("unit")
+            unit = dataset.attrs.get("unit", b"")
+            unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
+            if unit != field.unit:
                 problems.append(f"'{field.name}' is in {unit!r}, not in '{field.unit}'")
     return arrays, problems
 
 
-def _image_problems(
-    file: h5py.File,
-    camera: str,
-    checksums: np.ndarray,
-    attributes: dict[str, Any],
-    decode: bool,
-) -> Iterable[str]:
+def _image_problems(frames: FrameStore, camera: str, attributes: dict[str, Any]) -> Iterable[str]:
     """The first problem of each kind that a camera's frames have."""
-    dataset = dataset_of(file, f"{IMAGE_GROUP}/{camera}")
-    steps = attributes.get("num_steps")
-    if dataset.shape[:1] != (steps,) or checksums.shape != (steps,):
-        return [f"images of '{camera}' are {dataset.shape[0]}, not {steps}"]
-    if not decode:
-        return []
     problems: dict[str, str] = {}
     size = attributes.get("image_size")
-    for step in range(dataset.shape[0]):
+    for step in range(len(frames.checksum)):
         where = f"frame {step} of '{camera}'"
         try:
-            data = np.asarray(dataset[step])
-            if image_checksum(data) != int(checksums[step]):
-                problems.setdefault("checksum", f"{where} is damaged: its checksum is wrong")
-                continue
-            image = decode_image(data)
+            data = frames.encoded(step)
         except READ_ERRORS as error:
+            problems.setdefault("read", f"{where} cannot be read: {one_line(error)}")
+            continue
+        try:
+            image = decode_image(data)
+        except ValueError as error:
             problems.setdefault("decode", f"{where} cannot be decoded: {one_line(error)}")
             continue
         if list(image.shape) != [*(size or ()), 3] or image.dtype != np.uint8:
@@ -168,16 +158,13 @@ def _image_problems(
 
 def _unknown(file: h5py.File, attributes: dict[str, Any]) -> Iterable[str]:
     """Keys that the table does not know: of another release, or put there by somebody."""
-    groups = {IMAGE_GROUP, CHECKSUM_GROUP}
-    yield from (
-        f"key '{name}'" for name in file if name not in FIELD_BY_NAME and name not in groups
-    )
+    known = {*FIELD_BY_NAME, IMAGE_GROUP}
+    yield from (f"key '{name}'" for name in file if name not in known)
     yield from (f"attribute '{name}'" for name in file.attrs if name not in ATTRIBUTE_BY_NAME)
     cameras = set(_names(attributes.get("cameras")))
-    for group in groups & set(file):
-        members = file[group]
-        if isinstance(members, h5py.Group):
-            yield from (f"key '{group}/{name}'" for name in members if name not in cameras)
+    members = file.get(IMAGE_GROUP)
+    if isinstance(members, h5py.Group):
+        yield from (f"key '{IMAGE_GROUP}/{name}'" for name in members if name not in cameras)
 
 
 def _names(value: Any) -> list[str]:

@@ -14,8 +14,10 @@ from typing import Literal
 SCHEMA = "robo_manip_baselines/episode"
 SCHEMA_VERSION = 1
 
+# A group for each camera: `data`, the pictures one after another; `offset` (T + 1,), where each
+# begins; `checksum` (T,), the CRC-32 of each. HDF5's own type for rows of varying length is not
+# used: it has no checksum, and a changed byte in it can make the library loop for ever.
 IMAGE_GROUP = "images"
-CHECKSUM_GROUP = "image_checksums"
 
 Size = int | str
 AttributeKind = Literal["text", "json", "int", "float", "bool", "vector"]
@@ -222,4 +224,11 @@ def attribute_table() -> str:
     for item in ATTRIBUTES:
         kind = f"{item.length} numbers" if item.kind == "vector" else item.kind
         lines.append(f"| `{item.name}` | {kind} | {item.description} |")
+    return "\n".join(lines)
+
+
+def symbol_table() -> str:
+    """The shape symbols as a Markdown table, as printed in ``docs/episode_format.md``."""
+    lines = ["| symbol | size |", "|---|---|"]
+    lines += [f"| {symbol} | {text} |" for symbol, text in SYMBOLS.items()]
     return "\n".join(lines)

@@ -11,9 +11,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from robo_manip_baselines.data.episode import EpisodeFileError, open_hdf5
+from robo_manip_baselines.data.episode import READ_ERRORS, EpisodeFileError, open_hdf5
 from robo_manip_baselines.data.file_check import (
-    READ_ERRORS,
     Problem,
     readable_attributes,
     verify_file,

@@ -14,7 +14,6 @@ from robo_manip_baselines.envs.mujoco.vx300s import FINGER_CLOSED, FINGER_OPEN, 
 from robo_manip_baselines.expert.kinematics import ArmKinematics
 from robo_manip_baselines.expert.phases import (
     DOWN,
-    LEVEL,
     Approach,
     Command,
     Follow,
@@ -22,6 +21,7 @@ from robo_manip_baselines.expert.phases import (
     Phase,
     Reach,
     View,
+    level_at,
 )
 
 GRASP_OFFSET = 0.03
@@ -34,12 +34,12 @@ CLEARANCE = 0.10
 LIFT = 0.12
 """m straight up after the grasp, more than ``feeding_success.LIFT_HEIGHT``."""
 
-STANDOFF = np.array([0.22, 0.5, 0.33])
-"""m, world: level and in front of the face, from where the approach runs."""
+STANDOFF = np.array([0.20, 0.0, 0.0])
+"""m from where the mouth is to where the approach starts, level and straight in front of it."""
 
-INSERTION = np.array([0.022, 0.0, 0.0])
-"""m from the mouth to the gripper when it lets go: the cube's centre is then 8 mm behind the
-lips, the finger tips before them."""
+INSERTION = np.array([0.028, 0.0, 0.0])
+"""m from the mouth to the gripper when it lets go: the cube's centre is then 2 mm behind the
+mouth's centre, the finger tips before the corners of the lips."""
 
 WITHDRAWAL = np.array([0.14, 0.0, 0.0])
 """m from the mouth to the gripper before it turns home."""
@@ -123,7 +123,8 @@ def _phases(config: FeedingExpertConfig, home: Command) -> list[Phase]:
         return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
 
     def standoff(view: View, last: Command) -> Command:
-        return Command(STANDOFF, LEVEL, last.finger)
+        position = view.mouth() + STANDOFF
+        return Command(position, level_at(position), last.finger)
 
     def go_home(view: View, last: Command) -> Command:
         return home

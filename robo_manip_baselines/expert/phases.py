@@ -16,12 +16,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.face_env import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.scene import ARM_BASES
 
-LEVEL = mink.SO3.from_matrix(np.diag([-1.0, -1.0, 1.0]))
-"""Gripper level and pointing along world -x, into the mouth of a face that looks along +x."""
+RIGHT_BASE = np.array(ARM_BASES["right"][0])
+"""m, world: the base of the arm that feeds."""
 
-DOWN = LEVEL @ mink.SO3.from_y_radians(np.pi / 2)
+DOWN = mink.SO3.from_z_radians(np.pi) @ mink.SO3.from_y_radians(np.pi / 2)
 """Gripper pointing straight down, its fingers closing along world y."""
+
+
+def level_at(position: NDArray[np.float64]) -> mink.SO3:
+    """Return the orientation of a level gripper at ``position``, pointing away from the arm's base.
+
+    Straight in front of the base this is along world -x, into the mouth of a face that looks along
+    +x. Elsewhere it turns with the arm: to keep pointing along -x there, the wrist would have to
+    work around its singularity, where forearm and gripper are in line.
+
+    Args:
+        position: (3,) m, world.
+    """
+    away = position - RIGHT_BASE
+    return mink.SO3.from_z_radians(float(np.arctan2(away[1], away[0])))
 
 
 @dataclass(frozen=True)
@@ -143,7 +158,7 @@ class Grip:
 
 
 class Approach:
-    """Move towards the mouth so as to be there when the time is up (Algorithm 1, lines 9 to 15).
+    """Move, level, towards the mouth so as to be there when the time is up (Algorithm 1, lines 9 to 15).
 
     The velocity is (mouth - gripper) / (limit - t), with t since the lift and the gripper where it
     was last told to be.
@@ -167,7 +182,7 @@ class Approach:
         left = max(self._limit - elapsed, CONTROL_PERIOD)
         velocity = (view.mouth(self._lead) - self._command.position) / left
         position = self._command.position + velocity * CONTROL_PERIOD
-        self._command = replace(self._command, position=position)
+        self._command = replace(self._command, position=position, orientation=level_at(position))
         return self._command
 
     def is_done(self, view: View) -> bool:
@@ -177,7 +192,7 @@ class Approach:
 
 
 class Follow:
-    """Keep a place relative to the mouth, getting there gently.
+    """Keep a place relative to the mouth, level, getting there gently.
 
     Args:
         offset: (3,) m, world, from the mouth.
@@ -212,7 +227,7 @@ class Follow:
         reach = self._speed * CONTROL_PERIOD
         self._gap = self._gap * (0.0 if distance <= reach else 1.0 - reach / distance)
         position = view.mouth(self._lead) + self._offset + self._gap
-        self._last = replace(self._last, position=position)
+        self._last = replace(self._last, position=position, orientation=level_at(position))
         return self._last
 
     def is_done(self, view: View) -> bool:

@@ -54,7 +54,7 @@ def test_listing_is_by_seed_and_skips_everything_else(tmp_path: Path) -> None:
     assert [path.name for path in list_episodes(tmp_path)] == [names[2], names[0], names[1]]
     assert finished_seeds(tmp_path) == {2, 5, 10, 1000000}
     assert finished_seeds(tmp_path / "not there") == set()
-    with pytest.raises(RequestError, match="'.*not there' is no folder"):
+    with pytest.raises(RequestError, match=r"'.*not there' is no folder"):
         list_episodes(tmp_path / "not there")
 
 
@@ -65,7 +65,7 @@ def test_atomic_file_is_whole_or_not_there(tmp_path: Path) -> None:
         assert temporary.parent == path.parent
         assert not path.exists()
     assert path.read_text() == "{}"
-    with pytest.raises(KeyboardInterrupt), atomic_file(path) as temporary:
+    with pytest.raises(KeyboardInterrupt), atomic_file(path) as temporary:  # noqa: PT012
         temporary.write_text("half")
         raise KeyboardInterrupt
     assert path.read_text() == "{}"
@@ -90,7 +90,7 @@ def test_folder_that_cannot_be_written_is_a_wrong_request(tmp_path: Path) -> Non
     assert prepare_folder(tmp_path / "a" / "b").is_dir()
     assert list((tmp_path / "a" / "b").iterdir()) == []
     (tmp_path / "file").touch()
-    with pytest.raises(RequestError, match="cannot write to '.*file/x': Not a directory"):
+    with pytest.raises(RequestError, match=r"cannot write to '.*file/x': Not a directory"):
         prepare_folder(tmp_path / "file" / "x")
     with pytest.raises(RequestError, match="cannot write to '/proc/x'"):
         prepare_folder("/proc/x")
@@ -125,7 +125,7 @@ def test_killed_run_leaves_whole_files_and_is_carried_on(tmp_path: Path) -> None
         now = finished_seeds(tmp_path)
         assert kept <= now
         kept = now
-    assert 0 < len(kept)
+    assert len(kept) > 0
     problems = verify_dataset(tmp_path) if list_episodes(tmp_path) else []
     assert [problem for problem in problems if not problem.is_warning] == []
 

@@ -53,7 +53,7 @@ def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
 
 
 def test_unknown_codec_lists_the_valid_ones() -> None:
-    with pytest.raises(RequestError, match="unknown image codec 'jpg'.*jpeg, png, raw"):
+    with pytest.raises(RequestError, match=r"unknown image codec 'jpg'.*jpeg, png, raw"):
         encode_image(make_frames(1)[0], "jpg")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -38,16 +39,28 @@ def write(
 def seal(file: h5py.File) -> None:
     """Make the digest right again, so that only the damage itself can be found."""
     arrays = {field.name: file[field.name][()] for field in FIELDS}
-    checksums = {name: file["image_checksums"][name][()] for name in file["image_checksums"]}
+    checksums = {name: group["checksum"][()] for name, group in file["images"].items()}
     attributes = {item.name: loaded_attribute(item, file.attrs[item.name]) for item in ATTRIBUTES}
     file.attrs["content_sha256"] = content_digest(arrays, checksums, attributes)
 
 
 def put_frame(file: h5py.File, camera: str, step: int, data: np.ndarray) -> None:
     """Replace a frame, its checksum and the digest: what a faulty writer would have written."""
-    file[f"images/{camera}"][step] = data
-    file[f"image_checksums/{camera}"][step] = image_checksum(data)
+    group = file[f"images/{camera}"]
+    offset = group["offset"][()]
+    old = group["data"][()]
+    new = np.concatenate([old[: offset[step]], data, old[offset[step + 1] :]])
+    offset[step + 1 :] += len(data) - (offset[step + 1] - offset[step])
+    del group["data"]
+    group["data"], group["offset"][...] = new, offset
+    group["checksum"][step] = image_checksum(data)
     seal(file)
+
+
+def swap_frame(file: h5py.File) -> None:
+    """Change a byte of a picture, leaving its checksum as it was."""
+    group = file["images/top"]
+    group["data"][group["offset"][4] + 300] ^= 1
 
 
 def _remove(name: str) -> Callable[[h5py.File], None]:
@@ -85,15 +98,20 @@ def _frame(data: np.ndarray) -> Callable[[h5py.File], None]:
 
 DAMAGE: list[tuple[Callable[[h5py.File], Any], str]] = [
     (_remove("action"), "'action' is missing"),
-    (_remove("images/top"), "images of 'top' cannot be read: is missing"),
-    (_remove("image_checksums/top"), "images of 'top' cannot be read: is missing"),
+    (_remove("images"), "no dataset 'images/front_close/"),
+    (_remove("images/top"), "no dataset 'images/top/"),
+    (_remove("images/top/offset"), "no dataset 'images/top/offset'"),
+    (_remove("images/top/checksum"), "no dataset 'images/top/checksum'"),
     (lambda file: file.attrs.__delitem__("seed"), "attribute 'seed' is missing"),
     (_replace("action", lambda x: x[:, :6]), "'action' has A=6, not 7 or 14"),
     (_replace("action", lambda x: x[:-1]), "'action' has T=11 where 'time' has T=12"),
     (_replace("mouth_position", lambda x: x[:, :5]), "(12, 5, 3), not (T, 6, 3)"),
     (_replace("qpos", lambda x: x[:, 0]), "'qpos' has shape (12,), not (T, Q)"),
     (_replace("qpos", lambda x: x.astype(np.float32)), "'qpos' is float32, not float64"),
-    (_replace("images/top", lambda x: x[:-1]), "images of 'top' are 11, not 12"),
+    (
+        _replace("images/top/offset", lambda x: x[:-1]),
+        "'images/top' cannot be read: 11 frames instead of 12",
+    ),
     (lambda file: file["qpos"].attrs.__setitem__("unit", "cm"), "'qpos' is in 'cm', not in 'm, "),
     (_assign("qvel", (5, 1), np.nan), "'qvel' is NaN or infinite, first at step 5"),
     (_assign("action", (7, 0), -np.inf), "'action' is NaN or infinite, first at step 7"),
@@ -109,7 +127,7 @@ DAMAGE: list[tuple[Callable[[h5py.File], Any], str]] = [
     (_attribute("num_steps", np.int64(13)), "attribute 'num_steps' says 13, but 'time' has 12"),
     (_attribute("expert", "another"), "do not fit 'content_sha256'"),
     (lambda file: file["qpos"].__setitem__((0, 0), 0.5), "do not fit 'content_sha256'"),
-    (lambda file: file["images/top"].__setitem__(4, make_images()["top"][5]), "frame 4 of 'top'"),
+    (swap_frame, "frame 4 of 'top' cannot be read: its checksum is wrong"),
     (_frame(np.frombuffer(b"no picture", np.uint8)), "frame 4 of 'top' cannot be decoded"),
     (_frame(make_images()["top"][4][:0]), "frame 4 of 'top' cannot be decoded"),
     (_frame(encode_image(make_frames(size=(24, 30))[0])), "frame 4 of 'top' is (24, 30, 3)"),
@@ -125,11 +143,11 @@ def test_damage_is_found_and_named(
     with h5py.File(path, "a") as file:
         damage(file)
     problems = [problem for problem in verify_file(path) if not problem.is_warning]
-    assert len(problems) == 1
-    assert message in str(problems[0])
-    assert str(problems[0]).startswith(f"{path}: ")
-    assert "\n" not in str(problems[0])
-    assert problems[0] in verify_dataset(tmp_path)
+    assert any(message in str(problem) for problem in problems), problems
+    for problem in problems:
+        assert str(problem).startswith(f"{path}: ")
+        assert "\n" not in str(problem)
+        assert problem in verify_dataset(tmp_path)
     assert {problem.path for problem in verify_dataset(tmp_path)} == {path}
 
 
@@ -157,7 +175,7 @@ def test_missing_file(tmp_path: Path) -> None:
 def test_without_images_frames_are_not_read(tmp_path: Path) -> None:
     path = write(tmp_path)
     with h5py.File(path, "a") as file:
-        file["images/top"][4] = make_images()["top"][5]
+        swap_frame(file)
     assert verify_file(path, images=False) == []
     assert len(verify_file(path)) == 1
 
@@ -253,7 +271,7 @@ def contents(path: Path) -> Iterator[tuple[str, str]]:
 
 
 FUZZ = settings(
-    max_examples=300,
+    max_examples=int(os.environ.get("FUZZ_EXAMPLES", "80")),
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

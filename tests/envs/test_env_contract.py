@@ -197,7 +197,7 @@ def test_bad_arguments_get_one_clear_line(
 
 
 def test_unknown_environments_are_named() -> None:
-    with pytest.raises(RequestError, match="unknown environment 'FeedinEnv' .*'FeedingEnv'"):
+    with pytest.raises(RequestError, match=r"unknown environment 'FeedinEnv' .*'FeedingEnv'"):
         make_env("FeedinEnv")
 
 

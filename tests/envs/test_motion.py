@@ -120,9 +120,9 @@ def test_starts_are_uniform_over_every_frame_that_leaves_twelve_seconds(
 def test_clips_restrict_the_draw(library: MotionLibrary) -> None:
     rng = np.random.default_rng(0)
     assert {library.draw(rng, clips=["clip2"]).clip for _ in range(20)} == {"clip2"}
-    with pytest.raises(RequestError, match="unknown clip 'clip9'.*valid: clip0, clip1, clip2"):
+    with pytest.raises(RequestError, match=r"unknown clip 'clip9'.*valid: clip0, clip1, clip2"):
         library.draw(rng, clips=["clip9"])
-    with pytest.raises(RequestError, match="no run .* lasts 12 s in clips clip1"):
+    with pytest.raises(RequestError, match=r"no run .* lasts 12 s in clips clip1"):
         library.draw(rng, clips=["clip1"])
 
 
@@ -161,9 +161,9 @@ def test_truncated_and_missing_files_are_refused_by_name(tmp_path: Path) -> None
     whole = path.read_bytes()
     for length in (0, 10, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])
-        with pytest.raises(RequestError, match="library.npz' cannot be read"):
+        with pytest.raises(RequestError, match=r"library.npz' cannot be read"):
             MotionLibrary.load(path)
-    with pytest.raises(RequestError, match="nowhere.npz' does not exist"):
+    with pytest.raises(RequestError, match=r"nowhere.npz' does not exist"):
         MotionLibrary.load(tmp_path / "nowhere.npz")
 
 

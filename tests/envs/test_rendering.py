@@ -263,7 +263,8 @@ NO_CONTEXT = """
 import mujoco
 from robo_manip_baselines.envs.mujoco.rendering import CameraRenderer
 from robo_manip_baselines.errors import RequestError
-model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera name='eye'/></worldbody></mujoco>")
+xml = "<mujoco><worldbody><camera name='eye'/></worldbody></mujoco>"
+model = mujoco.MjModel.from_xml_string(xml)
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
 renderer = CameraRenderer(model, 8, 8)

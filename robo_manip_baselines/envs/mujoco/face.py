@@ -38,6 +38,8 @@ _TEXTURE_FILE: Final = "face_texture.png"
 _EYE_RADIUS: Final = 0.0122
 _IRIS_RADIUS: Final = 0.0064
 _PUPIL_RADIUS: Final = 0.0034
+_EAR_ANGLE: Final = 0.35
+"""Ears stand off the head by this much, radians."""
 _SHIRT: Final = (0.23, 0.42, 0.60, 1.0)
 _LINING: Final = (0.30, 0.09, 0.10, 1.0)
 _TONGUE: Final = (0.72, 0.34, 0.36, 1.0)
@@ -58,7 +60,9 @@ def add_face(spec: mujoco.MjSpec) -> None:
     model = FaceModel.load()
     rest = model.body_poses(_NOMINAL_MOUTH, (1, 0, 0, 0), REST_OPENING)
     body = {
-        name.removeprefix("face/"): spec.worldbody.add_body(name=name, mocap=True, pos=at, quat=turn)
+        name.removeprefix("face/"): spec.worldbody.add_body(
+            name=name, mocap=True, pos=at, quat=turn
+        )
         for name, (at, turn) in rest.items()
     }
     body["mouth"].add_site(name="mouth", size=(0.002, 0.002, 0.002), rgba=(0, 0, 0, 0), group=4)
@@ -142,7 +146,7 @@ def _add_eyes(head: mujoco.MjsBody, model: FaceModel) -> None:
                 name=f"face/{part}_{side}",
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 size=(radius, 0, 0),
-                pos=centre + [forward, 0, 0],
+                pos=centre + np.array([forward, 0.0, 0.0]),
                 rgba=rgba,
                 **_VISUAL,
             )
@@ -151,37 +155,33 @@ def _add_eyes(head: mujoco.MjsBody, model: FaceModel) -> None:
 def _add_ears(head: mujoco.MjsBody) -> None:
     kind = mujoco.mjtGeom.mjGEOM_ELLIPSOID
     for name, side in (("left", 1), ("right", -1)):
-        outward = mujoco_quat((0, 0, 1), side * 0.35)
+        half_turn = side * _EAR_ANGLE / 2
         head.add_geom(
             name=f"face/ear_{name}",
             type=kind,
             size=(0.017, 0.006, 0.031),
             pos=(-0.034, side * 0.080, 0.006),
-            quat=outward,
+            quat=(np.cos(half_turn), 0.0, 0.0, np.sin(half_turn)),
             rgba=_colour(SKIN),
             **_VISUAL,
         )
 
 
-def mujoco_quat(axis: tuple[float, float, float], angle: float) -> Floats:
-    quat = np.empty(4)
-    mujoco.mju_axisAngle2Quat(quat, np.asarray(axis, float), angle)
-    return quat
-
-
 def _add_mouth_parts(
     spec: mujoco.MjSpec, head: mujoco.MjsBody, jaw: mujoco.MjsBody, model: FaceModel
 ) -> None:
-    closed = model.vertices[model.rings["lips_inner"]].mean(axis=0)
-    upper = face_mesh.teeth(closed + [-0.004, 0.0, 0.008], -0.009)
-    lower = face_mesh.teeth(closed + [-0.006, 0.0, -0.009] - model.hinge, 0.008, 0.019, 0.024)
+    lips = model.vertices[model.rings["lips_inner"]].mean(axis=0)
+    upper = face_mesh.teeth(lips + np.array([-0.004, 0.0, 0.008]), -0.009)
+    # the lower arch is smaller and bites behind the upper one
+    foot = lips + np.array([-0.006, 0.0, -0.009]) - model.hinge
+    lower = face_mesh.teeth(foot, 0.008, 0.019, 0.024)
     _add_mesh(spec, head, "teeth_upper", upper, _TEETH)
     _add_mesh(spec, jaw, "teeth_lower", lower, _TEETH)
     jaw.add_geom(
         name="face/tongue",
         type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
         size=(0.026, 0.017, 0.007),
-        pos=closed + [-0.038, 0.0, -0.009] - model.hinge,
+        pos=lips + np.array([-0.038, 0.0, -0.009]) - model.hinge,
         rgba=_TONGUE,
         **_VISUAL,
     )

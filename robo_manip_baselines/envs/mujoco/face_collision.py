@@ -7,6 +7,7 @@ way to food; the inside of the mouth (contype 4) meets the cube only, and holds 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any, Final
 
 import mujoco
@@ -19,7 +20,12 @@ from robo_manip_baselines.envs.mujoco.face_model import (
     rotate,
 )
 
-_HIDDEN: Final[dict[str, Any]] = {"mass": 0, "group": 3, "conaffinity": 0, "rgba": (0.9, 0.5, 0.2, 0.4)}
+_HIDDEN: Final[dict[str, Any]] = {
+    "mass": 0,
+    "group": 3,
+    "conaffinity": 0,
+    "rgba": (0.9, 0.5, 0.2, 0.4),
+}
 _OUTSIDE: Final[dict[str, Any]] = {**_HIDDEN, "contype": 2}
 _INSIDE: Final[dict[str, Any]] = {**_HIDDEN, "contype": 4}
 
@@ -37,7 +43,7 @@ _ELLIPSOIDS: Final = (
 )
 
 _MOUTH_BOXES: Final = (
-    # name, half sizes, centre in the mouth frame, tilt about y (positive: front edge up... )
+    # name, half sizes, centre in the mouth frame, tilt about y (negative: falls to the back)
     ("tongue_floor", (0.037, 0.035, 0.006), (-0.038, 0.0, -0.034), -0.07),
     ("cheek_left", (0.036, 0.006, 0.036), (-0.042, 0.040, 0.0), 0.0),
     ("cheek_right", (0.036, 0.006, 0.036), (-0.042, -0.040, 0.0), 0.0),
@@ -104,14 +110,16 @@ def _add_lips(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
     angle = model.jaw_angle(REST_OPENING)
     at = model.deform(angle)
     back = hinge_quaternion(angle) * [1, -1, -1, -1]
-    outer = dict(zip(model.rings["lips_inner"].tolist(), model.rings["lips_outer"].tolist(), strict=True))
+    outer = dict(
+        zip(model.rings["lips_inner"].tolist(), model.rings["lips_outer"].tolist(), strict=True)
+    )
     count = 0
     for owner, chain in (("head", _UPPER_CHAIN), ("jaw", _LOWER_CHAIN)):
         inner = np.array(chain)
         line = 0.5 * (at[inner] + at[[outer[i] for i in chain]]) - [_LIP_RADIUS, 0.0, 0.0]
         if owner == "jaw":
             line = rotate(back, line - model.hinge)
-        for start, end in zip(line[:-1], line[1:], strict=True):
+        for start, end in pairwise(line):
             body[owner].add_geom(
                 name=f"face/lip_{count}",
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,

@@ -28,21 +28,22 @@ _LINING = (
     (0.003, 1.06, 0.003),
     (0.010, 1.15, 0.010),
     (0.030, 1.10, 0.012),
-    (0.060, 0.70, 0.008),
-    (0.064, 0.00, 0.000),
+    (0.050, 0.70, 0.008),
+    (0.053, 0.00, 0.000),
 )
 """Rings of the mouth's inside; the last one closes it."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles, counter-clockwise from outside, and how far each vertex follows the second bone."""
+    """Triangles, counter-clockwise from outside, and each vertex's share of the second bone."""
 
     vertices: Floats  # (V, 3)
     triangles: NDArray[np.int32]  # (F, 3)
     weight: Floats  # (V,) 0..1
 
     def joined(self, other: Surface) -> Surface:
+        """Both surfaces as one."""
         return Surface(
             np.concatenate([self.vertices, other.vertices]),
             np.concatenate([self.triangles, other.triangles + len(self.vertices)]).astype(np.int32),
@@ -120,7 +121,9 @@ def hair(model: FaceModel) -> Surface:
     steps = np.linspace(0.0, 1.0, 14)
     around = np.abs(np.arctan2(start[:, 1], start[:, 2] - SKULL_CENTRE[2]))  # 0 up, pi down
     # where hair begins: at the outline on top, behind the ear at the side, low at the nape
-    hairline = np.interp(around, np.deg2rad([0, 45, 80, 105, 140, 180]), [0, 0, 0.1, 0.42, 0.62, 0.66])
+    hairline = np.interp(
+        around, np.deg2rad([0, 45, 80, 105, 140, 180]), [0, 0, 0.1, 0.42, 0.62, 0.66]
+    )
     depth = steps[:, None] - hairline
     swell = HAIR_THICKNESS * np.clip(depth / 0.12, -0.8, 1.0)
     rings = _skull_rings(start, steps, swell)

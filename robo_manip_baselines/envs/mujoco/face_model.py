@@ -113,7 +113,9 @@ class FaceModel:
         # signed, so that lips which touch or overlap by a hair do not fold the table
         axis = pair[-1, 0] - pair[-1, 1]
         distance = (pair[:, 0] - pair[:, 1]) @ axis / np.linalg.norm(axis)
-        distance = np.where(distance > 2e-3, np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1), distance)
+        distance = np.where(
+            distance > 2e-3, np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1), distance
+        )
         end = int(np.searchsorted(distance, MAX_OPENING))
         return distance[: end + 1], angle[: end + 1]
 
@@ -176,7 +178,7 @@ def world_from_body(orientation: ArrayLike) -> Floats:
 
 
 def hinge_quaternion(angle: Floats) -> Floats:
-    """Quaternion (..., 4) of opening the jaw by ``angle`` (...) rad: about +y, chin down and back."""
+    """Quaternion (..., 4) of a jaw opened by ``angle`` (...) rad: about +y, chin down and back."""
     quat = np.zeros((*np.shape(angle), 4))
     quat[..., 0], quat[..., 2] = np.cos(angle / 2), np.sin(angle / 2)
     return quat

@@ -40,13 +40,19 @@ DARK = (60, 30, 26)
 # MediaPipe face mesh indices of what is painted beyond the rings of the surface file.
 _CHEEKS = (50, 280)
 _NOSTRILS = (((98, 240, 99), (64, 240)), ((327, 460, 328), (294, 460)))
-_UPPER_LASHES = ((33, 246, 161, 160, 159, 158, 157, 173, 133),
-                 (263, 466, 388, 387, 386, 385, 384, 398, 362))
-_LOWER_LASHES = ((33, 7, 163, 144, 145, 153, 154, 155, 133),
-                 (263, 249, 390, 373, 374, 380, 381, 382, 362))
+_UPPER_LASHES = (
+    (33, 246, 161, 160, 159, 158, 157, 173, 133),
+    (263, 466, 388, 387, 386, 385, 384, 398, 362),
+)
+_LOWER_LASHES = (
+    (33, 7, 163, 144, 145, 153, 154, 155, 133),
+    (263, 249, 390, 373, 374, 380, 381, 382, 362),
+)
 _CREASES = ((247, 30, 29, 27, 28, 56), (467, 260, 259, 257, 258, 286))
-_BROWS = ((70, 63, 105, 66, 107, 55, 65, 52, 53, 46),
-          (300, 293, 334, 296, 336, 285, 295, 282, 283, 276))
+_BROWS = (
+    (70, 63, 105, 66, 107, 55, 65, 52, 53, 46),
+    (300, 293, 334, 296, 336, 285, 295, 282, 283, 276),
+)
 _LIP_CORNERS = (61, 291)
 
 
@@ -76,7 +82,9 @@ class _Canvas:
     def blend(self, colour: Sequence[float], mask: Floats) -> None:
         self.image += (np.asarray(colour) - self.image) * mask[..., None]
 
-    def spot(self, colour: Sequence[float], centre: Floats, size: Sequence[float], alpha: float) -> None:
+    def spot(
+        self, colour: Sequence[float], centre: Floats, size: Sequence[float], alpha: float
+    ) -> None:
         """A Gaussian spot; ``size`` is its standard deviation across and up, metres."""
         away = (self.grid - centre) / np.asarray(size)
         self.blend(colour, alpha * np.exp(-0.5 * (away**2).sum(axis=-1)))
@@ -129,7 +137,9 @@ def paint() -> NDArray[np.uint8]:
     for side in (0, 1):
         lid, crease = list(_UPPER_LASHES[side]), list(_CREASES[side])
         canvas.spot(SHADE, at[crease].mean(axis=0), (0.016, 0.006), 0.25)
-        canvas.spot(SHADE, at[list(_LOWER_LASHES[side])].mean(axis=0) - [0, 0.004], (0.012, 0.004), 0.2)
+        canvas.spot(
+            SHADE, at[list(_LOWER_LASHES[side])].mean(axis=0) - [0, 0.004], (0.012, 0.004), 0.2
+        )
         canvas.stroke(SHADE, at[crease], 0.0003, 0.55)
         canvas.stroke(DARK, at[lid], 0.0010, 0.95)
         canvas.stroke(SHADE, at[list(_LOWER_LASHES[side])], 0.0002, 0.6)

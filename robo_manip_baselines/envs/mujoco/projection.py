@@ -40,8 +40,8 @@ def project_points(
     depth = -in_camera[..., 2:]
     focal = height / 2 / math.tan(math.radians(fovy) / 2)  # pixels
     with np.errstate(divide="ignore", invalid="ignore"):
-        offset = focal * in_camera[..., :2] / depth * (1, -1)
-    return np.where(depth > 0, offset + (width / 2, height / 2), np.nan)
+        from_centre = focal * in_camera[..., :2] / depth * (1, -1)
+    return np.where(depth > 0, from_centre + np.array([width / 2, height / 2]), np.nan)
 
 
 def project(

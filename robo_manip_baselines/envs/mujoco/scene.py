@@ -241,11 +241,11 @@ def _add_room(spec: mujoco.MjSpec) -> None:
             specular=(0.2, 0.2, 0.2) if shadow else (0, 0, 0),
             castshadow=shadow,
         )
-    # front_close sees the mouth from half a metre, from the side of the arm that does not feed and
+    # front_close sees the mouth from 0.58 m, from the side of the arm that does not feed and
     # from its own height: from above, pitching heads hide their mouths from a detector.
     for name, position, target, fovy in (
         ("top", (0.08, BASE_Y, 1.15), (0.08, BASE_Y, 0.0), 48.0),
         ("angle", (0.60, -0.35, 0.72), (0.10, BASE_Y, 0.18), 45.0),
-        ("front_close", (0.383, BASE_Y - 0.321, 0.35), (0.0, BASE_Y, 0.35), FRONT_CLOSE_FOVY),
+        ("front_close", (0.444, BASE_Y - 0.373, 0.35), (0.0, BASE_Y, 0.35), FRONT_CLOSE_FOVY),
     ):
         world.add_camera(name=name, pos=position, quat=look_at(position, target), fovy=fovy)

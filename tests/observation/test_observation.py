@@ -1,0 +1,125 @@
+"""What a policy is shown, against slow and obvious oracles."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.observation import ObservationSpec, Truth, observe
+
+
+def truth(shape: tuple[int, ...], arms: int, seed: int = 0) -> Truth:
+    rng = np.random.default_rng(seed)
+    return Truth(
+        time=rng.random(shape),
+        joint_position=rng.random((*shape, arms, 6)),
+        joint_velocity=rng.random((*shape, arms, 6)),
+        gripper_position=rng.random((*shape, arms)),
+        gripper_velocity=rng.random((*shape, arms)),
+        end_effector_position=rng.random((*shape, 3)),
+        mouth_position=rng.random((*shape, 6, 3)),
+        object_position=rng.random((*shape, 3)),
+    )
+
+
+def obvious(spec: ObservationSpec, true: Truth) -> dict[str, list[float]]:
+    """One observation, number by number, as the tables of the docs say."""
+    state: list[float] = []
+    for arm in range(len(spec.arm_names)):
+        state += [*true.joint_position[arm], *true.joint_velocity[arm]]
+        state += [true.gripper_position[arm], true.gripper_velocity[arm]]
+    shown = {"state": state}
+    gripper = true.end_effector_position
+
+    def distance(k: int) -> float:
+        return float(sum((true.mouth_position[k] - gripper) ** 2) ** 0.5)
+
+    if spec.obs == "current":
+        shown["mouth"] = [*true.mouth_position[0], distance(0)]
+    if spec.obs == "current_pred":
+        numbers: list[float] = []
+        for k in range(spec.horizon + 1):
+            numbers += [float(true.time) + k / 30, *true.mouth_position[k]]
+        shown["prediction"] = numbers + [distance(k) for k in range(spec.horizon + 1)]
+    if spec.object_pose:
+        shown["object_position"] = [*true.object_position]
+    return shown
+
+
+specs = st.builds(
+    ObservationSpec,
+    obs=st.sampled_from(["baseline", "current", "current_pred"]),
+    horizon=st.integers(1, 5),
+    cameras=st.just(()),
+    object_pose=st.booleans(),
+    arms=st.sampled_from(["right", "both"]),
+)
+
+
+@given(specs, st.integers(0, 2**32 - 1))
+def test_observe_is_what_the_tables_say(spec: ObservationSpec, seed: int) -> None:
+    true = truth((), len(spec.arm_names), seed)
+    shown, expected = observe(spec, true), obvious(spec, true)
+    assert set(shown) == set(expected) == set(spec.components())
+    for key, value in shown.items():
+        np.testing.assert_allclose(value, expected[key], rtol=1e-6)  # float32
+        assert value.dtype == np.float32
+        assert len(spec.components()[key]) == value.shape[0]
+
+
+@given(specs)
+def test_a_batch_is_its_members(spec: ObservationSpec) -> None:
+    arms = len(spec.arm_names)
+    batch = truth((3, 4), arms)
+    together = observe(spec, batch)
+    for i in range(3):
+        for j in range(4):
+            alone = observe(spec, Truth(**{k: v[i, j] for k, v in vars(batch).items()}))
+            for key in alone:
+                np.testing.assert_array_equal(alone[key], together[key][i, j])
+
+
+def test_sizes_of_the_papers_presets() -> None:
+    sizes = {
+        (obs, horizon): {
+            key: len(names)
+            for key, names in ObservationSpec(obs=obs, horizon=horizon).components().items()
+        }
+        for obs in ("baseline", "current", "current_pred")
+        for horizon in (1, 2, 5)
+    }
+    assert sizes["baseline", 2] == {"state": 14}
+    assert sizes["current", 2] == {"state": 14, "mouth": 4}
+    assert sizes["current_pred", 1] == {"state": 14, "prediction": 10}
+    assert sizes["current_pred", 2] == {"state": 14, "prediction": 15}
+    assert sizes["current_pred", 5] == {"state": 14, "prediction": 30}
+
+
+@given(specs)
+def test_json_round_trip(spec: ObservationSpec) -> None:
+    assert ObservationSpec.from_json(json.loads(json.dumps(spec.to_json()))) == spec
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"obs": "all"},
+        {"horizon": 0},
+        {"horizon": 6},
+        {"cameras": ("side",)},
+        {"image_size": (480, 0)},
+        {"image_size": (480, 5000)},
+        {"error": "some"},
+        {"arms": "none"},
+    ],
+)
+def test_invalid_values_are_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(RequestError) as caught:
+        ObservationSpec(**values)
+    assert str(next(iter(values.values()))).strip("()',").split(",")[0] in str(caught.value)

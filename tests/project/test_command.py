@@ -1,0 +1,204 @@
+"""One clear line and the right exit code, whatever is wrong with a command line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+import tyro
+
+from robo_manip_baselines.command import parse, run_command
+from robo_manip_baselines.errors import RequestError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Try out a command line."""
+
+    env: Annotated[str, tyro.conf.arg(metavar="ENV"), tyro.conf.Positional]
+    """Name of the environment."""
+    num_episodes: int = 50
+    """How many."""
+    ratio: float = 0.5
+    """How much."""
+    image_codec: Literal["jpeg", "png", "raw"] = "jpeg"
+    """How images are kept."""
+    out: Path = Path("dataset")
+    """Where to."""
+    scripted: bool = False
+    """Who acts."""
+
+    def __post_init__(self) -> None:
+        if self.num_episodes < 0:
+            raise RequestError(f"num_episodes is 0 or more, not {self.num_episodes}; " + "x" * 200)
+
+
+EXAMPLE = "python bin/Try.py FeedingEnv --num_episodes 3"
+
+
+@pytest.mark.parametrize("spelling", ["--num_episodes", "--num-episodes"])
+@pytest.mark.parametrize("sign", [" ", "="])
+def test_underscores_and_hyphens(spelling: str, sign: str) -> None:
+    options = parse(Options, EXAMPLE, args=["A", *f"{spelling}{sign}7".split(), "--scripted"])
+    assert options == Options("A", num_episodes=7, scripted=True)
+
+
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        ("", ["missing", "ENV", "Name of the environment"]),
+        ("A B", ["'B'", "too many"]),
+        ("A --nmu_episodes 3", ["'--nmu_episodes'", "mean '--num_episodes'", "--image_codec"]),
+        ("A --nmu-episodes=3", ["'--nmu-episodes'", "mean '--num_episodes'"]),
+        ("A --zzz", ["unknown option '--zzz'", "--num_episodes, --ratio, --image_codec, --out"]),
+        ("A --num_episodes x", ["--num_episodes is a whole number, not 'x'"]),
+        ("A --num_episodes 1.5", ["--num_episodes is a whole number, not '1.5'"]),
+        ("A --ratio half", ["--ratio is a number, not 'half'"]),
+        ("A --num_episodes", ["--num_episodes needs a value"]),
+        ("A --image_codec gif", ["--image_codec", "'jpeg', 'png', 'raw'", "not 'gif'"]),
+        ("A --num_episodes -3", ["num_episodes is 0 or more, not -3; xxxx"]),
+    ],
+)
+def test_wrong_options_are_one_line(
+    args: str, parts: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(RequestError) as caught:
+        parse(Options, EXAMPLE, args=args.split())
+    message = str(caught.value)
+    for part in parts:
+        assert part in message
+    assert "\n" not in message
+    assert not set("│╭╰─\x1b") & set(message)
+    output = capsys.readouterr()
+    assert (output.out, output.err) == ("", "")
+
+
+def test_message_of_the_options_comes_through_unbroken() -> None:
+    with pytest.raises(RequestError, match=r"^num_episodes is 0 or more, not -1; x{200}$"):
+        parse(Options, EXAMPLE, args=["A", "--num_episodes", "-1"])
+
+
+def test_help_shows_defaults_and_the_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        parse(Options, EXAMPLE, args=["--help"])
+    assert not caught.value.code
+    page = capsys.readouterr().out
+    for part in ("Try out a command line.", EXAMPLE, "--num_episodes", "default: 50", "How many."):
+        assert part in page
+
+
+@dataclass(frozen=True)
+class First:
+    """The first."""
+
+    alpha: int = 1
+
+
+@dataclass(frozen=True)
+class Second:
+    """The second."""
+
+    beta: int = 2
+
+
+BOTH = (
+    Annotated[First, tyro.conf.subcommand("first")]
+    | Annotated[Second, tyro.conf.subcommand("second")]
+)
+
+
+def test_subcommands() -> None:
+    assert parse(BOTH, "x", args=["second", "--beta", "3"]) == Second(3)
+    with pytest.raises(RequestError, match=r"'third' is no subcommand.*first, second"):
+        parse(BOTH, "x", args=["third"])
+    with pytest.raises(RequestError, match=r"Expected one of \{first, second\}"):
+        parse(BOTH, "x", args=[])
+    with pytest.raises(RequestError, match=r"'--bata' .*mean '--beta'.*valid: --beta;"):
+        parse(BOTH, "x", args=["second", "--bata", "3"])
+
+
+def run(body: str) -> subprocess.CompletedProcess[str]:
+    code = (
+        "import logging, os, sys, time\n"
+        "from robo_manip_baselines.command import run_command\n"
+        "from robo_manip_baselines.errors import RequestError\n"
+        f"def main():\n    {body}\n"
+        "run_command(main)\n"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "code", "out", "err"),
+    [
+        ("print('done')", 0, "done\n", ""),
+        ("return 1", 1, "", ""),
+        ("raise SystemExit(3)", 3, "", ""),
+        ("raise RequestError('no camera\\n  \"tpo\"')", 2, "", 'error: no camera "tpo"\n'),
+        ("raise KeyboardInterrupt", 130, "", "interrupted\n"),
+        ("logging.getLogger('x').info('hello')", 0, "", "hello\n"),
+    ],
+)
+def test_exit_codes(body: str, code: int, out: str, err: str) -> None:
+    done = run(body)
+    assert (done.returncode, done.stdout, done.stderr) == (code, out, err)
+
+
+def test_other_failures_keep_their_traceback() -> None:
+    done = run("raise ValueError('a bug')")
+    assert done.returncode == 1
+    assert done.stderr.startswith("Traceback")
+    assert "ValueError: a bug" in done.stderr
+
+
+def test_signal_from_the_terminal() -> None:
+    code = (
+        "import time\nfrom robo_manip_baselines.command import run_command\n"
+        "def main():\n    print('ready', flush=True)\n    time.sleep(60)\nrun_command(main)\n"
+    )
+    command = [sys.executable, "-c", code]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+        assert process.stderr.read() == "interrupted\n"
+
+
+@pytest.mark.parametrize("lines", [1, 100_000])
+def test_reader_that_leaves_is_no_traceback(lines: int) -> None:
+    code = (
+        "import time\nfrom robo_manip_baselines.command import run_command\n"
+        f"def main():\n    time.sleep(0.2)\n    for i in range({lines}):\n        print(i)\n"
+        "run_command(main)\n"
+    )
+    reader, writer = os.pipe()
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", code], stdout=writer, stderr=pipe) as process:
+        os.close(reader)
+        os.close(writer)
+        assert process.stderr is not None
+        assert process.stderr.read() == b""
+        assert process.wait(30) == 1
+
+
+def test_broken_pipe_elsewhere_is_a_failure_that_is_seen() -> None:
+    done = run("raise BrokenPipeError(32, 'a worker died')")
+    assert done.returncode == 1
+    assert "a worker died" in done.stderr
+
+
+def test_run_command_always_ends_the_process() -> None:
+    with pytest.raises(SystemExit) as caught:
+        run_command(lambda: None)
+    assert caught.value.code == 0
