@@ -28,7 +28,7 @@ test: setup opengl ## every test but the slow ones (under 10 minutes on two core
 	$(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)
 
 test-fast: setup ## the tests that need no OpenGL (under a minute)
-	$(BIN)/python -m pytest -n 2 -m "not slow and not gl" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 2 -m "not slow and not long and not gl" $(PYTEST_ARGS)
 
 check: setup ## format, lint, types
 	$(BIN)/ruff format --check

@@ -18,7 +18,7 @@ from face_prediction.lifting import VERTICAL_FOV_DEGREES
 from face_prediction.motion import ClipMotion, MotionSettings, lift
 from face_prediction.npz_file import read_npz
 from face_prediction.quality import QualityLimits
-from face_prediction.report import clip_row, write_report
+from face_prediction.report import clip_row, read_page, write_report
 from face_prediction.tracks import load_track
 
 logger = logging.getLogger(__name__)
@@ -93,6 +93,8 @@ def run_export_motion(options: ExportMotionOptions) -> int:
         max_depth_tremor=options.max_depth_tremor,
     )
     refuse_other_files(options.out)
+    if options.report is not None:
+        read_page(options.report)  # refused now rather than when all is done
     paths = track_files(options.tracks)
     rows = None if options.attribution is None else read_attributions(options.attribution)
     clips: list[tuple[str, Attribution, ClipMotion]] = []

@@ -90,6 +90,23 @@ def page(library: MotionLibrary, plots: Sequence[str]) -> str:
     return "\n\n".join([BEGIN, tables(library), *pictures, END])
 
 
+def read_page(path: Path) -> str:
+    """The text of the page at ``path``, or of an empty one.
+
+    Raises:
+        RequestError: the page exists without the two marks, or cannot be read.
+    """
+    if not path.exists():
+        return f"{BEGIN}\n{END}\n"
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RequestError(f"--report {path}: cannot be read ({error})") from None
+    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
+        raise RequestError(f"--report {path}: lacks the lines '{BEGIN}' and '{END}'")
+    return text
+
+
 def write_report(
     path: Path, library: MotionLibrary, clips: Sequence[tuple[str, ClipMotion]]
 ) -> None:
@@ -101,11 +118,7 @@ def write_report(
     Raises:
         RequestError: matplotlib is missing, or the page exists without the marks.
     """
-    text = f"{BEGIN}\n{END}\n"
-    if path.is_file():
-        text = path.read_text(encoding="utf-8")
-    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        raise RequestError(f"--report {path}: lacks the lines '{BEGIN}' and '{END}'")
+    text = read_page(path)
     from face_prediction.plots import plot_clip
 
     shortest = library.metadata["settings"]["min_run"]

@@ -23,7 +23,7 @@ class Verify:
     folder: Annotated[Path, tyro.conf.arg(metavar="DIR"), tyro.conf.Positional]
     """Folder of episode_*.hdf5 files, as Rollout.py writes it."""
     images: bool = True
-    """Decode every image, too; --no_images checks the rest only, in a tenth of the time."""
+    """Decode every image, too; --no_images checks the rest only, which is much faster."""
 
     def run(self) -> tuple[str, int]:
         """The text to print and the exit code."""

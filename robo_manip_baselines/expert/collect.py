@@ -66,11 +66,11 @@ class Collection:
         env_id(self.env)
         require_choice("expert", self.expert, EXPERTS)
         require_choice("image codec", self.codec, CODECS)
-        if len(self.seeds) < 1 or self.seeds.start < 0:
-            raise RequestError(
-                f"{len(self.seeds)} episodes from seed {self.seeds.start}: "
-                "both must be whole numbers, at least 1 and 0"
-            )
+        if self.seeds.start < 0:
+            raise RequestError(f"seed {self.seeds.start}: must be 0 or more")
+        if len(self.seeds) < 1:
+            count = self.seeds.stop - self.seeds.start
+            raise RequestError(f"num_episodes {count}: must be 1 or more")
         if self.workers < 1:
             raise RequestError(f"workers {self.workers}: must be at least 1")
         if not 1 <= self.quality <= 100:

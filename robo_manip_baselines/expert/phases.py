@@ -158,7 +158,9 @@ class Grip:
 
 
 class Approach:
-    """Move, level, towards the mouth so as to be there when the time is up (Algorithm 1, lines 9 to 15).
+    """Move, level, towards the mouth so as to be there when the time is up.
+
+    That is lines 9 to 15 of the paper's Algorithm 1.
 
     The velocity is (mouth - gripper) / (limit - t), with t since the lift and the gripper where it
     was last told to be.

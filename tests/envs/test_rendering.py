@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -327,3 +328,20 @@ def test_a_forked_worker_is_told_to_open_its_own(
             patched.setattr(os, "getpid", lambda: -1)
             with pytest.raises(RuntimeError, match="in each worker"):
                 renderer.render(data, ["above"])
+
+
+def test_the_benchmark_says_how_to_get_what_it_compares_with(
+    repository: Path, tmp_path: Path
+) -> None:
+    result = subprocess.run(
+        [sys.executable, "benchmarks/render_cameras.py", "--gym_aloha", str(tmp_path)],
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert "pip install --no-deps --target /tmp/gym-aloha gym-aloha==0.1.5" in result.stderr

@@ -134,6 +134,17 @@ def test_names_that_scripts_lean_on(model: mujoco.MjModel) -> None:
     assert not np.any(model.dof_frictionloss)  # dry friction makes a servo creep
 
 
+def test_nothing_is_drawn_that_costs_a_cpu_much(model: mujoco.MjModel) -> None:
+    # Measured: textures and reflections cost per pixel, lights and cylinders per vertex.
+    assert model.ntex == 0
+    assert not np.any(model.mat_reflectance)
+    assert model.nlight <= 2
+    drawn = model.geom_group < 3  # the groups that a camera shows
+    assert not np.any(model.geom_type[drawn] == mujoco.mjtGeom.mjGEOM_CYLINDER)
+    assert np.all(model.geom_rgba[drawn, 3] == 1)
+    assert model.nmeshface < 2500
+
+
 def touches(a: tuple[int, int], b: tuple[int, int]) -> bool:
     """MuJoCo's rule for two geoms' (contype, conaffinity)."""
     return bool(a[0] & b[1] or b[0] & a[1])
@@ -388,6 +399,9 @@ def test_neighbouring_links_never_touch_and_a_folded_arm_does(
     address = [model.joint(f"right/{joint}").qposadr[0] for joint in ARM_JOINTS]
     for angles in rng.uniform(*limits.T, (400, 6)):
         data.qpos[address] = angles
+        finger = rng.choice([FINGER_CLOSED - 1e-4, FINGER_OPEN])  # pressed shut, or open
+        data.joint("right/left_finger").qpos = finger
+        data.joint("right/right_finger").qpos = -finger
         mujoco.mj_forward(model, data)
         seen |= body_pairs(model, data)
     assert not seen & never

@@ -43,7 +43,7 @@ _EAR_ANGLE: Final = 0.35
 _SHIRT: Final = (0.23, 0.42, 0.60, 1.0)
 _LINING: Final = (0.30, 0.09, 0.10, 1.0)
 _TONGUE: Final = (0.72, 0.34, 0.36, 1.0)
-_TEETH: Final = (0.95, 0.93, 0.88, 1.0)
+_TEETH: Final = (0.88, 0.85, 0.78, 1.0)
 _SCLERA: Final = (0.96, 0.95, 0.94, 1.0)
 _IRIS: Final = (0.30, 0.19, 0.11, 1.0)
 _PUPIL: Final = (0.03, 0.02, 0.02, 1.0)
@@ -90,9 +90,8 @@ def _add_materials(spec: mujoco.MjSpec) -> None:
 
 
 def _add_skins(spec: mujoco.MjSpec, model: FaceModel) -> None:
-    face = Surface(model.vertices, model.triangles, model.jaw_weight)
     jaw = ("face/jaw", model.hinge)
-    _add_skin(spec, "face/skin", face.joined(face_mesh.head_back(model)), jaw, "face/skin")
+    _add_skin(spec, "face/skin", face_mesh.head(model), jaw, "face/skin")
     _add_skin(spec, "face/lining", face_mesh.mouth_lining(model), jaw, "face/lining")
     mouth = model.lip_centre(model.jaw_angle(REST_OPENING))
     collar = mouth + np.array([-0.125, 0.0, -0.135])
@@ -173,7 +172,7 @@ def _add_mouth_parts(
     lips = model.vertices[model.rings["lips_inner"]].mean(axis=0)
     upper = face_mesh.teeth(lips + np.array([-0.004, 0.0, 0.008]), -0.009)
     # the lower arch is smaller and bites behind the upper one
-    foot = lips + np.array([-0.006, 0.0, -0.009]) - model.hinge
+    foot = lips + np.array([-0.006, 0.0, -0.011]) - model.hinge
     lower = face_mesh.teeth(foot, 0.008, 0.019, 0.024)
     _add_mesh(spec, head, "teeth_upper", upper, _TEETH)
     _add_mesh(spec, jaw, "teeth_lower", lower, _TEETH)

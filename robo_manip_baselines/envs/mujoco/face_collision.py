@@ -26,8 +26,25 @@ _HIDDEN: Final[dict[str, Any]] = {
     "conaffinity": 0,
     "rgba": (0.9, 0.5, 0.2, 0.4),
 }
-_OUTSIDE: Final[dict[str, Any]] = {**_HIDDEN, "contype": 2}
-_INSIDE: Final[dict[str, Any]] = {**_HIDDEN, "contype": 4}
+_SOFT: Final[dict[str, Any]] = {
+    # Flesh gives way: a finger of the arm sinks in by a millimetre for every newton or two. The
+    # geoms have priority, or the stiff rubber of the finger pads would decide.
+    "priority": 2,
+    "solref": (0.05, 1.0),
+    "solimp": (0.9, 0.9, 0.001, 0.5, 2.0),
+}
+_OUTSIDE: Final[dict[str, Any]] = {
+    **_HIDDEN,
+    **_SOFT,
+    "contype": 2,
+    "friction": (0.3, 0.005, 0.0001),
+}
+_INSIDE: Final[dict[str, Any]] = {
+    **_HIDDEN,
+    **_SOFT,
+    "contype": 4,
+    "friction": (1.0, 0.01, 0.0001),
+}
 
 _LIP_RADIUS: Final = 0.004
 _UPPER_CHAIN: Final = (78, 80, 82, 312, 310, 308)
@@ -44,7 +61,7 @@ _ELLIPSOIDS: Final = (
 
 _MOUTH_BOXES: Final = (
     # name, half sizes, centre in the mouth frame, tilt about y (negative: falls to the back)
-    ("tongue_floor", (0.037, 0.035, 0.006), (-0.038, 0.0, -0.034), -0.07),
+    ("tongue_floor", (0.045, 0.035, 0.006), (-0.030, 0.0, -0.032), -0.07),
     ("cheek_left", (0.036, 0.006, 0.036), (-0.042, 0.040, 0.0), 0.0),
     ("cheek_right", (0.036, 0.006, 0.036), (-0.042, -0.040, 0.0), 0.0),
     ("throat", (0.006, 0.040, 0.036), (-0.082, 0.0, 0.0), 0.0),
@@ -71,7 +88,6 @@ def add_collision(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
             size=size,
             pos=centre,
             quat=(np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0),
-            friction=(1.0, 0.01, 0.0001),
             **_INSIDE,
         )
 

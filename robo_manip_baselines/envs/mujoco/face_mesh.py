@@ -42,14 +42,6 @@ class Surface:
     triangles: NDArray[np.int32]  # (F, 3)
     weight: Floats  # (V,) 0..1
 
-    def joined(self, other: Surface) -> Surface:
-        """Both surfaces as one."""
-        return Surface(
-            np.concatenate([self.vertices, other.vertices]),
-            np.concatenate([self.triangles, other.triangles + len(self.vertices)]).astype(np.int32),
-            np.concatenate([self.weight, other.weight]),
-        )
-
 
 def strips(rings: int, points: int, closed: bool = True) -> NDArray[np.int32]:
     """Triangles (F, 3) that join consecutive rings; the next ring lies to the left of a ring."""
@@ -103,13 +95,21 @@ def _skull_rings(start: Floats, steps: Floats, swell: Floats) -> Floats:
     return on_skull + gap + swell[..., None] * direction
 
 
-def head_back(model: FaceModel) -> Surface:
-    """From the outline of the face over the skull to its back; its front ring is the outline."""
-    outline = face_oval(model)
-    steps = np.linspace(0.0, 1.0, 8)
-    rings = _skull_rings(model.vertices[outline], steps, np.zeros((8, len(outline))))
+def head(model: FaceModel) -> Surface:
+    """The measured face (vertices 0 to 467) and, from its outline on, the skull to its back.
+
+    Face and skull share the outline's vertices, so that no edge shows between them.
+    """
+    outline = face_oval(model)[::-1]
+    count, steps = len(outline), np.linspace(0.0, 1.0, 8)
+    rings = _skull_rings(model.vertices[outline], steps, np.zeros((8, count)))
     weight = model.jaw_weight[outline] * ((1 - steps) ** 2)[:, None]
-    return loft(rings[:, ::-1], weight[:, ::-1])
+    number = np.concatenate([outline, len(model.vertices) + np.arange(7 * count)])
+    return Surface(
+        np.concatenate([model.vertices, rings[1:].reshape(-1, 3)]),
+        np.concatenate([model.triangles, number[strips(8, count)]]).astype(np.int32),
+        np.concatenate([model.jaw_weight, weight[1:].ravel()]),
+    )
 
 
 def hair(model: FaceModel) -> Surface:

@@ -15,12 +15,6 @@ import numpy as np
 from robo_manip_baselines.envs.mujoco.vx300s import arm_spec
 from robo_manip_baselines.errors import RequestError
 
-ARMS: Final = ("left", "right")
-"""Name prefixes of the two arms: ``left/waist`` …"""
-
-CAMERAS: Final = ("top", "angle", "front_close")
-"""The cell's cameras."""
-
 TIMESTEP: Final = 0.002
 """Physics step, seconds: ten make one control step at 50 Hz."""
 
@@ -133,7 +127,11 @@ def look_at(position: Sequence[float], target: Sequence[float]) -> np.ndarray:
 
 
 def _set_options(option: mujoco.MjOption) -> None:
-    """Set every option that matters, so that no release's defaults decide for us."""
+    """Set every option that matters, so that no release's defaults decide for us.
+
+    (The cell has no weld; whoever adds one should state its ``torquescale``, which releases have
+    changed too.)
+    """
     option.timestep = TIMESTEP
     option.gravity = (0.0, 0.0, -9.81)
     # Implicit in the servos' velocity feedback: stable at 2 ms with stiff, well damped servos.
@@ -212,11 +210,12 @@ def _add_room(spec: mujoco.MjSpec) -> None:
                 contype=0,
                 conaffinity=0,
             )
-    # A floor and two walls: all that the cameras see behind the table.
+    # A floor and three walls: all that is seen behind the table.
     for name, size, position in (
         ("floor", (3.0, 3.0, 0.01), (0, BASE_Y, -_TABLE_HEIGHT - 0.01)),
         ("wall_back", (3.0, 0.01, 2.0), (0, BASE_Y + 3.0, 2.0 - _TABLE_HEIGHT)),
         ("wall_left", (0.01, 3.0, 2.0), (-3.0, BASE_Y, 2.0 - _TABLE_HEIGHT)),
+        ("wall_right", (0.01, 3.0, 2.0), (3.0, BASE_Y, 2.0 - _TABLE_HEIGHT)),
     ):
         world.add_geom(
             name=name,

@@ -1,0 +1,151 @@
+"""Collecting demonstrations: same files in any number of processes, killed or not."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robo_manip_baselines.data import EpisodeReader, list_episodes, read_metadata
+from robo_manip_baselines.data.verify import verify_dataset
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.evaluation.episode_replay import deviation
+from robo_manip_baselines.expert.collect import Collection, collect
+from robo_manip_baselines.expert.rollout_command import RolloutOptions, to_collection
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).resolve().parents[2]
+OPTIONS = RolloutOptions("FeedingEnv", scripted=True, num_episodes=3, cameras=("none",), workers=1)
+ARGUMENTS = ["FeedingEnv", "--scripted", "--num_episodes", "3", "--cameras", "none"]
+
+
+def collection(out: Path, **changes: Any) -> Collection:
+    return replace(to_collection(replace(OPTIONS, out=out)), **changes)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three episodes, recorded in this process."""
+    out = tmp_path_factory.mktemp("demonstrations") / "one"
+    collect(collection(out))
+    return out
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in list_episodes(folder)}
+
+
+def test_any_number_of_workers_writes_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    collect(collection(tmp_path, workers=2))
+    assert contents(tmp_path) == contents(folder)
+    assert len(contents(folder)) == 3
+
+
+def test_the_replay_reproduces_every_recorded_state(folder: Path) -> None:
+    for path in list_episodes(folder):
+        found = deviation(path)
+        assert (found.qpos, found.qvel) == (0.0, 0.0)
+        assert found.steps > 100
+
+
+def test_the_files_are_whole_and_say_what_happened(folder: Path) -> None:
+    assert verify_dataset(folder) == []
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["episodes"] == summary["successes"] == 3
+    assert summary["failed_seeds"] == []
+    times = [read_metadata(path)["completion_time"] for path in list_episodes(folder)]
+    assert summary["completion_time_mean"] == pytest.approx(np.mean(times))
+    assert summary["completion_time_sd"] == pytest.approx(np.std(times, ddof=1))
+    with EpisodeReader(list_episodes(folder)[1]) as episode:
+        mouth, clock = episode.array("mouth_position"), episode.array("time")
+        # What was the truth 5 frames (1/6 s) ahead is the truth then, between two control steps.
+        later = np.stack([np.interp(clock + 5 / 30, clock, axis) for axis in mouth[:, 0].T], -1)
+        inside = clock + 5 / 30 < clock[-1]
+        # Interpolating 50 Hz samples of a 30 Hz polyline misses its corners by little.
+        np.testing.assert_allclose(mouth[inside, 5], later[inside], atol=2e-3)
+        np.testing.assert_allclose(np.diff(clock), 0.02, atol=1e-9)
+
+
+def test_carries_on_where_it_was(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "some"
+    shutil.copytree(folder, out)
+    (out / "episode_000001.hdf5").unlink()
+    (out / ".episode_000001.hdf5.999999999.partial").write_bytes(b"half")
+    kept = (out / "episode_000000.hdf5").stat().st_mtime_ns
+    collect(collection(out))
+    assert contents(out) == contents(folder)
+    assert (out / "episode_000000.hdf5").stat().st_mtime_ns == kept
+    assert not list(out.glob(".*"))
+
+
+def test_refuses_to_mix_settings(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mixed"
+    shutil.copytree(folder, out)
+    with pytest.raises(RequestError, match="holds episodes with expert reactive, not anticip"):
+        collect(collection(out, expert="anticipatory"))
+    with pytest.raises(RequestError, match="holds episodes with env_kwargs"):
+        collect(to_collection(replace(OPTIONS, out=out, face_motion="after_lift")))
+
+
+def test_killed_and_continued_it_ends_with_the_same_files(folder: Path, tmp_path: Path) -> None:
+    """SIGKILL at several moments; what is there is always whole."""
+    out = tmp_path / "killed"
+    command = [sys.executable, "bin/Rollout.py", *ARGUMENTS, "--preview", "0", "--out", str(out)]
+    for patience in (2.5, 3.5):
+        process = subprocess.Popen(
+            command, cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        time.sleep(patience)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        for path in list_episodes(out) if out.is_dir() else []:
+            assert path.read_bytes() == (folder / path.name).read_bytes()
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    assert contents(out) == contents(folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["FeedinEnv", "--scripted"], "unknown environment 'FeedinEnv'"),
+        (["FeedingEnv"], "--scripted"),
+        (["FeedingEnv", "--scripted", "--cameras", "side"], "unknown camera 'side'"),
+        (["FeedingEnv", "--scripted", "--expert", "chef"], "unknown expert 'chef'"),
+        (["FeedingEnv", "--scripted", "--clips", "me"], "unknown clip 'me'"),
+        (["FeedingEnv", "--scripted", "--num_episodes", "-3"], "num_episodes -3"),
+        (["FeedingEnv", "--scripted", "--num_episodes", "0"], "num_episodes 0"),
+        (["FeedingEnv", "--scripted", "--num_episodes", "many"], "many"),
+        (["FeedingEnv", "--scripted", "--seed", "-1"], "-1"),
+        (["FeedingEnv", "--scripted", "--workers", "0"], "workers 0"),
+        (["FeedingEnv", "--scripted", "--preview", "-1"], "preview -1"),
+        (["FeedingEnv", "--scripted", "--image_size", "big"], "image size 'big'"),
+        (["FeedingEnv", "--scripted", "--image_codec", "gif"], "unknown image codec 'gif'"),
+        (["FeedingEnv", "--scripted", "--image_quality", "0"], "image quality 0"),
+        (["FeedingEnv", "--scripted", "--face_motion", "no"], "unknown face motion 'no'"),
+        (["FeedingEnv", "--scripted", "--motion_library", "no.npz"], "'no.npz' does not exist"),
+        (["FeedingEnv", "--scripted", "--sedd", "1"], "--sedd"),
+        (["FeedingEnv", "--scripted", "--out", "/proc/nowhere"], "/proc/nowhere"),
+    ],
+)
+def test_bad_requests_get_one_line_and_exit_code_2(
+    tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    command = [sys.executable, str(ROOT / "bin/Rollout.py"), *arguments]
+    if "--cameras" not in arguments:
+        command += ["--cameras", "none"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 2, result.stderr
+    assert message in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())  # nothing half-written

@@ -1,0 +1,158 @@
+"""``export-motion`` from the command line: tracks and a table in, a library and a report out."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from face_prediction.cli import main
+from face_prediction.library import load_library
+from face_prediction.report import BEGIN, END
+from face_prediction.tracks import save_track
+
+TABLE = """clip,subject,ship,licence,source
+steady.mp4,ann,yes,MIT,here
+lively.mp4,bob,yes,CC BY 4.0,there
+secret.mp4,eve,no,unknown,elsewhere
+"""
+
+
+def sway(frames: int, amplitude: float) -> np.ndarray:
+    time = np.arange(frames)[:, None] / 30
+    return np.array([0.0, 0.0, -0.5]) + amplitude * np.sin(2 * np.pi * time * [0.5, 0.3, 0.2])
+
+
+@pytest.fixture
+def folder(tmp_path: Path, make_track) -> Path:
+    tracks = tmp_path / "tracks"
+    valid = np.ones(200, dtype=bool)
+    valid[100] = False
+    save_track(tracks / "steady.npz", make_track(sway(100, 0.0), name="steady.mp4"))
+    save_track(tracks / "lively.npz", make_track(sway(200, 0.02), valid=valid, name="lively.mp4"))
+    save_track(tracks / "secret.npz", make_track(sway(100, 0.02), name="secret.mp4"))
+    (tmp_path / "clips.csv").write_text(TABLE)
+    return tmp_path
+
+
+@pytest.fixture
+def run(folder: Path, caplog):
+    caplog.set_level(logging.INFO)
+
+    def export(*arguments: object, tracks: Path | None = None) -> int:
+        words = ["export-motion", str(tracks or folder / "tracks"), *map(str, arguments)]
+        return main([*words, "--out", str(folder / "motion.npz"), "--min_run", "1"])
+
+    return export
+
+
+def test_only_clips_that_may_ship_are_in_the_library(folder: Path, run) -> None:
+    assert run("--attribution", folder / "clips.csv") == 0
+    library = load_library(folder / "motion.npz")
+    assert library.run_clip.tolist() == ["lively", "lively", "steady"]
+    assert library.run_subject.tolist() == ["bob", "bob", "ann"]
+    assert library.run_length.tolist() == [100, 99, 100]
+    assert "secret" not in str(library.metadata)
+    assert library.metadata["withheld_clips"] == 1
+    assert library.metadata["attribution"]["lively"] == {
+        "subject": "bob", "licence": "CC BY 4.0", "source": "there",
+    }  # fmt: skip
+    assert library.metadata["clips"]["lively"]["no_face"] == 1
+    assert library.metadata["settings"]["min_run"] == 1.0
+    assert "63 degrees" in library.metadata["camera_model"]
+    assert library.metadata["detectors"] == [{"name": "synthetic", "settings": {"zoom": False}}]
+
+
+def test_the_same_tracks_give_the_same_file(folder: Path, run) -> None:
+    files = []
+    for _ in range(2):
+        assert run("--attribution", folder / "clips.csv") == 0
+        with np.load(folder / "motion.npz") as stored:
+            files.append({key: stored[key].tolist() for key in stored.files})
+    assert files[0] == files[1]
+
+
+def test_without_a_table_nothing_is_claimed(folder: Path, run) -> None:
+    assert run() == 0
+    attribution = load_library(folder / "motion.npz").metadata["attribution"]
+    assert {row["licence"] for row in attribution.values()} == {"not stated"}
+
+
+def test_the_report(folder: Path, run) -> None:
+    page = folder / "docs" / "page.md"
+    page.parent.mkdir()
+    page.write_text(f"# Title\n\n{BEGIN}\nold\n{END}\n\nlast line\n")
+    assert run("--attribution", folder / "clips.csv", "--report", page) == 0
+    text = page.read_text()
+    assert text.startswith("# Title\n")
+    assert text.endswith("\n\nlast line\n")
+    assert "old" not in text
+    # two runs of (100 - 1) + (99 - 1) steps, and one of 99, at 30 a second
+    assert "9.9 s of continuous motion in 3 runs, of 2 people" in text
+    assert "| lively | 200 | 199 | 1 | 0 | 0 | 0 | 0 | 0 |" in text
+    assert "| steady | MIT | here |" in text
+    for clip in ("lively", "steady"):
+        picture = page.parent / "images" / f"motion_{clip}.png"
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert picture.stat().st_size < 80_000
+        assert f"(images/motion_{clip}.png)" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--attribution", "absent.csv"), "absent.csv: cannot be read"),
+        (("--min_run", "-1"), "--min_run -1.0: must be positive"),
+        (("--max_displacement", "0"), "--max_displacement 0.0: must be positive"),
+        (("--max_rotation", "nan"), "--max_rotation nan: must be positive"),
+        (("--depth_cutoff", "0"), "--depth_cutoff 0.0: must be positive"),
+        (("--min_run", "100"), "no run is long enough"),
+    ],
+)
+def test_bad_requests(folder: Path, caplog, arguments, message) -> None:
+    caplog.set_level(logging.INFO)
+    words = ["export-motion", str(folder / "tracks"), "--out", str(folder / "m.npz"), *arguments]
+    assert main(words) == 2
+    assert message in caplog.text
+    assert len(caplog.messages) == 1
+    assert not (folder / "m.npz").exists()
+
+
+def test_tracks_that_are_not_there(folder: Path, run, caplog) -> None:
+    assert run(tracks=folder / "absent") == 2
+    (folder / "empty").mkdir()
+    assert run(tracks=folder / "empty") == 2
+    assert run(folder / "tracks") == 2  # the same folder twice
+    assert [text.split(": ", 2)[-1] for text in caplog.messages][:2] == [
+        "no such file or folder; make tracks with extract",
+        "no .npz file in it; make tracks with extract",
+    ]
+    assert "two tracks named" in caplog.messages[2]
+
+
+def test_a_clip_without_a_row(folder: Path, run, caplog) -> None:
+    (folder / "clips.csv").write_text(TABLE.replace("lively", "other"))
+    assert run("--attribution", folder / "clips.csv") == 2
+    assert "no row for 'lively'" in caplog.text
+
+
+def test_a_damaged_track_is_named(folder: Path, run, caplog) -> None:
+    path = folder / "tracks" / "steady.npz"
+    path.write_bytes(path.read_bytes()[:2000])
+    assert run("--attribution", folder / "clips.csv") == 2
+    assert "steady.npz: damaged" in caplog.text
+
+
+def test_other_files_are_not_overwritten(folder: Path, run, caplog) -> None:
+    (folder / "motion.npz").write_text("precious")
+    assert run() == 2
+    assert (folder / "motion.npz").read_text() == "precious"
+    assert "in the way" in caplog.text
+    page = folder / "page.md"
+    page.write_text("a page without marks")
+    (folder / "motion.npz").unlink()
+    assert run("--report", page) == 2
+    assert page.read_text() == "a page without marks"
+    assert not (folder / "motion.npz").exists()
