@@ -27,6 +27,7 @@ demo: setup opengl ## five scripted feeding episodes and a preview video
 test: setup opengl ## every test but the slow ones (under 10 minutes on two cores)
 	$(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)
 
+test-fast: export MUJOCO_GL := disabled # so that a test that draws after all is found out
 test-fast: setup ## the tests that need no OpenGL (under a minute)
 	$(BIN)/python -m pytest -n 2 -m "not slow and not long and not gl" $(PYTEST_ARGS)
 

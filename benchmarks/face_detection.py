@@ -150,7 +150,9 @@ def write_pictures(views: Sequence[View], errors: NDArray[np.float64], folder: P
         for point, colour in ((view.mouth, (0, 255, 0)), (view.mouth + error, (255, 255, 0))):
             if np.isfinite(point).all():
                 cv2.drawMarker(image, point.round().astype(int).tolist(), colour, 1, 12, 1)
-        marked.append(cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA))
+        column = int(np.clip(view.mouth[0] - 160, 0, WIDTH - 320))
+        row = int(np.clip(view.mouth[1] - 150, 0, HEIGHT - 240))
+        marked.append(image[row : row + 240, column : column + 320])
     rows = [np.hstack(marked[start : start + 3]) for start in range(0, len(marked), 3)]
     save(folder / "face_poses.png", np.vstack(rows))
 
@@ -159,9 +161,10 @@ def closeups(poses: Sequence[tuple[float, float, float, float]]) -> NDArray[np.u
     """The face close by, side by side: yaw, pitch, roll in degrees and the jaw's opening in m."""
     model, data = compile_cell()
     eye = mujoco.MjvCamera()
-    eye.lookat, eye.distance, eye.azimuth, eye.elevation = MOUTH + CENTRE, 0.36, 152, -3
+    eye.lookat, eye.distance, eye.azimuth, eye.elevation = MOUTH + CENTRE, 0.52, 152, -3
     images = []
     with mujoco.Renderer(model, 2 * HEIGHT, WIDTH) as renderer:
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         for yaw, pitch, roll, jaw in poses:
             turn = np.array([1.0, 0.0, 0.0, 0.0])
             for axis, degrees in ((1, yaw), (0, pitch), (2, roll)):

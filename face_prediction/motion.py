@@ -13,6 +13,7 @@ import numpy as np
 from face_prediction.errors import RequestError
 from face_prediction.lifting import jaw_openings, mouth_centres
 from face_prediction.quality import Quality, QualityLimits, assess, tremor
+from face_prediction.rigid_pose import rigid_head_poses
 from face_prediction.rotations import continuous_quaternions, quaternion_from_matrix
 from face_prediction.runs import longest_runs, permitted_starts
 from face_prediction.tracks import FaceTrack
@@ -68,11 +69,12 @@ def lift(track: FaceTrack, settings: MotionSettings) -> ClipMotion:
             "extract it with --fps 30"
         )
     landmarks = track.landmarks.astype(float)
-    mouth = mouth_centres(landmarks, track.head_pose, track.image_size)
-    jaw = jaw_openings(landmarks, track.head_pose, track.image_size)
+    head_pose = rigid_head_poses(landmarks, track.valid, track.image_size)
+    mouth = mouth_centres(landmarks, head_pose, track.image_size)
+    jaw = jaw_openings(landmarks, head_pose, track.image_size)
     orientation = np.full((len(track), 4), np.nan)
     valid = track.valid
-    orientation[valid] = quaternion_from_matrix(track.head_pose[valid, :3, :3])
+    orientation[valid] = quaternion_from_matrix(head_pose[valid, :3, :3])
     quality = assess(mouth, orientation, jaw, track.fps, settings.limits)
     raw_depth = mouth[:, 2].copy()
     shaky = step_tremor(raw_depth) > settings.max_depth_tremor

@@ -28,6 +28,10 @@ CAMERA_MODEL = (
     "in the middle of the image, square pixels; origin at the camera, x right in the image, y up, "
     "z toward the camera; scale from MediaPipe's canonical face"
 )
+HEAD_POSE = (
+    "MediaPipe's fit of its canonical face, to the 25 of its 33 landmarks that do not move with "
+    "the mouth (brow, eyes, temples, nose)"
+)
 MOUTH_MODEL = (
     "mean of the 40 lip landmarks, each on its image ray where that meets the plane through the "
     "canonical mouth centre, normal to the head's z axis"
@@ -184,6 +188,7 @@ def describe(
     used = [clip for clip in clips if clip[2].runs]
     return {
         "camera_model": CAMERA_MODEL,
+        "head_pose": HEAD_POSE,
         "mouth": MOUTH_MODEL,
         "settings": asdict(settings),
         "detectors": [d for i, d in enumerate(detectors) if d not in detectors[:i]],

@@ -101,6 +101,14 @@ def _draw_position(axes: Any, seconds: np.ndarray, motion: ClipMotion) -> None:
             axes.axvline(seconds[edge], color="black", lw=0.8, ls=":")
     for step in np.flatnonzero(motion.quality.jump):
         axes.axvline(seconds[step], color="red", lw=0.8, ymin=0.95)
+    # wild values in what was cut must not flatten the rest
+    shown = 1000 * (motion.mouth[motion.quality.found] - origin)
+    low, high = np.percentile(shown, 2), np.percentile(shown, 98)
+    for start, stop in motion.runs:
+        kept = 1000 * (motion.mouth[start:stop] - origin)
+        low, high = min(low, kept.min()), max(high, kept.max())
+    margin = 0.08 * (high - low) + 1
+    axes.set_ylim(low - margin, high + margin)
     axes.set_ylabel("mouth from first kept, mm")
     axes.legend(loc="upper right", ncols=4, fontsize="small")
 

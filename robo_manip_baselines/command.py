@@ -39,7 +39,10 @@ _PLAINER = (
     ),
     (r"Error parsing (\S+): could not convert string to float: ('.*')", r"\1 is a number, not \2"),
     (r"Error parsing (\S+): ", r"\1: "),
-    (r"Missing value for argument '(\S+)'. Expected \d+ values?", r"\1 needs a value"),
+    (
+        r"Missing value for argument '?\(?'([^\s',]+)',?\)?'?\. Expected \d+ values?",
+        r"\1 needs a value",
+    ),
     (r"Missing from \S+?: ", "missing: "),
     (r" \(required\)", ""),
     (
@@ -62,6 +65,8 @@ def run_command(main: Callable[[], int | None]) -> NoReturn:
         SystemExit: always.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    # PyOpenGL tells every user that an accelerator, which nothing here needs, is not installed.
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)
     try:
         code = main() or 0
         sys.stdout.flush()

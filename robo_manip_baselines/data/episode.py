@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -212,6 +213,6 @@ def dataset_of(file: h5py.File, name: str) -> h5py.Dataset:
 def one_line(error: BaseException) -> str:
     """The message of an exception as one line."""
     message = error.args[0] if isinstance(error, KeyError) and error.args else error
-    if "filter returned failure" in str(message):  # HDF5's words for it
+    if re.search("filter returned failure|Fletcher32", str(message)):  # HDF5 2 and 1 say it so
         return "its checksum is wrong"
     return " ".join(str(message).split())

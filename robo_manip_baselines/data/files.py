@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from robo_manip_baselines.errors import RequestError
@@ -89,7 +89,8 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _flush_to_disk(path.parent)
+    with suppress(OSError):  # some network file systems cannot flush a folder
+        _flush_to_disk(path.parent)
 
 
 def remove_temporaries(folder: str | Path) -> list[Path]:

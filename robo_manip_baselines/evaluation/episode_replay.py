@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
 
 from robo_manip_baselines.data import EpisodeReader
-from robo_manip_baselines.envs.mujoco.face_env import FaceEnv
+from robo_manip_baselines.envs.mujoco.face_env import world_of
 from robo_manip_baselines.envs.mujoco.registration import NAMESPACE, make_env
 from robo_manip_baselines.errors import RequestError
 
@@ -54,11 +54,6 @@ def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any
             f"{recorded['versions']['robo_manip_baselines']}"
         )
     return env
-
-
-def world_of(env: gymnasium.Env[Any, Any]) -> FaceEnv:
-    """Return the environment inside Gymnasium's wrappers."""
-    return cast(FaceEnv, env.unwrapped)
 
 
 def replay(env: gymnasium.Env[Any, Any], episode: EpisodeReader) -> Iterator[int]:

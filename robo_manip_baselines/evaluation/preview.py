@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from robo_manip_baselines.data import EpisodeReader
-from robo_manip_baselines.envs.mujoco.face_env import CONTROL_PERIOD
+from robo_manip_baselines.data import EpisodeReader, read_metadata
+from robo_manip_baselines.envs.mujoco.face_env import CONTROL_PERIOD, world_of
 from robo_manip_baselines.envs.mujoco.projection import project
-from robo_manip_baselines.evaluation.episode_replay import remake_env, replay, world_of
+from robo_manip_baselines.evaluation.episode_replay import remake_env, replay
 from robo_manip_baselines.evaluation.video import (
     VideoWriter,
     draw_track,
@@ -33,8 +34,8 @@ VIEW_SIZE = (360, 480)
 MULTISAMPLES = 4
 
 
-def write_preview(path: Path, episodes: Iterable[Path]) -> None:
-    """Write one H.264 video of some episodes, one after the other.
+def write_preview(path: Path, episodes: Sequence[Path]) -> None:
+    """Write one H.264 video of some episodes, one after the other, with a progress bar.
 
     Args:
         path: of the video, ``....mp4``.
@@ -43,10 +44,16 @@ def write_preview(path: Path, episodes: Iterable[Path]) -> None:
     Raises:
         RequestError: an episode is damaged or of another model, or there is no OpenGL.
     """
-    with VideoWriter(path, 1.0 / (FRAME_STEPS * CONTROL_PERIOD)) as video:
+    steps = [int(read_metadata(episode)["num_steps"]) for episode in episodes]
+    frames = sum(-(-count // FRAME_STEPS) for count in steps)
+    with (
+        VideoWriter(path, 1.0 / (FRAME_STEPS * CONTROL_PERIOD)) as video,
+        tqdm(total=frames, unit="frame", desc=path.name) as progress,
+    ):
         for episode in episodes:
             for frame in preview_frames(episode):
                 video.write(frame)
+                progress.update()
 
 
 def preview_frames(path: Path) -> Iterator[NDArray[np.uint8]]:

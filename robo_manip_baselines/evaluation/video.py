@@ -128,7 +128,7 @@ def draw_track(
     colour: Colour = YELLOW,
     *,
     thickness: int = 2,
-    radius: int = 6,
+    radius: int = 8,
 ) -> np.ndarray:
     """Draw where a point has been: a line that fades towards its past, a ring at its present.
 
@@ -156,7 +156,9 @@ def draw_track(
     drawn = _paint(image, opacity, colour)
     if len(points) and valid[-1]:
         centre = (int(fixed[-1][0]), int(fixed[-1][1]))
-        cv2.circle(drawn, centre, radius * 16, BLACK, thickness + 2, cv2.LINE_AA, shift=4)
+        # The dark rim lies outside only: what is in the ring stays to be seen.
+        rim = radius * 16 + 8 * thickness + 8
+        cv2.circle(drawn, centre, rim, BLACK, 1, cv2.LINE_AA, shift=4)
         cv2.circle(drawn, centre, radius * 16, colour, thickness, cv2.LINE_AA, shift=4)
     return drawn
 

@@ -29,6 +29,7 @@ from robo_manip_baselines.data import (
     write_episode,
 )
 from robo_manip_baselines.data.images import CODECS, DEFAULT_QUALITY
+from robo_manip_baselines.envs.mujoco.face_env import world_of
 from robo_manip_baselines.envs.mujoco.registration import env_id, make_env
 from robo_manip_baselines.errors import RequestError, require_choice
 from robo_manip_baselines.expert.demonstrate import demonstrate
@@ -224,7 +225,7 @@ def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any])
         "expert": collection.expert,
         "image_codec": collection.codec,
         "image_quality": collection.quality,
-        "xml_hash": env.unwrapped.xml_hash,
+        "xml_hash": world_of(env).xml_hash,
     }
     for name, value in wanted.items():
         if there[name] != value:

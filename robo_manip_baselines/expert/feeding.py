@@ -58,7 +58,7 @@ class FeedingExpertConfig:
 
 EXPERTS: dict[str, FeedingExpertConfig] = {
     "reactive": FeedingExpertConfig(),
-    "anticipatory": FeedingExpertConfig(lead=0.1),
+    "anticipatory": FeedingExpertConfig(lead=4 / 30),
 }
 """``reactive`` is Algorithm 1 as published; ``anticipatory`` knows the recorded future."""
 

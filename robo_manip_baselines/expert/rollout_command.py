@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +13,6 @@ from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.evaluation.preview import write_preview
 from robo_manip_baselines.expert.collect import Collection, Summary, collect
 from robo_manip_baselines.observation import CAMERAS
-
-logger = logging.getLogger(__name__)
 
 PREVIEW = "preview.mp4"
 
@@ -73,7 +70,7 @@ def rollout(options: RolloutOptions) -> None:
     episodes = list_episodes(collection.out)[: options.preview]
     video = collection.out / PREVIEW if episodes else None
     if video:
-        _preview(video, episodes)
+        write_preview(video, episodes)
     print(table(collection, summary, video))  # noqa: T201
 
 
@@ -113,11 +110,6 @@ def parse_image_size(size: str) -> tuple[int, int]:
     if not (cross and height.isdecimal() and width.isdecimal()):
         raise RequestError(f"image size '{size}': must be HEIGHTxWIDTH, for example 480x640")
     return int(height), int(width)
-
-
-def _preview(video: Path, episodes: list[Path]) -> None:
-    logger.info("drawing a preview of %d episodes", len(episodes))
-    write_preview(video, episodes)
 
 
 def table(collection: Collection, summary: Summary, video: Path | None) -> str:

@@ -129,13 +129,13 @@ def test_track_ends_in_a_ring_and_fades_towards_its_past() -> None:
     drawn = draw_track(GREY, points, YELLOW)
     np.testing.assert_array_equal(GREY, before)
     distance = np.abs(drawn.astype(int) - YELLOW).sum(axis=2)
-    assert distance[30, 55] == 0  # the newest piece, in full colour
-    assert distance[30, 55] < distance[30, 40] < distance[30, 15] < distance[10, 10]
-    assert distance[30, 71] < 60  # the ring's radius is 6
+    assert distance[30, 52] == 0  # the newest piece, in full colour
+    assert distance[30, 52] < distance[30, 40] < distance[30, 15] < distance[10, 10]
+    assert distance[30, 73] < 60  # the ring's radius is 8
     changed = np.argwhere((drawn != GREY).any(axis=2))
-    assert changed[:, 0].min() >= 30 - 10
-    assert changed[:, 0].max() <= 30 + 10
-    assert changed[:, 1].max() <= 65 + 10
+    assert changed[:, 0].min() >= 30 - 12
+    assert changed[:, 0].max() <= 30 + 12
+    assert changed[:, 1].max() <= 65 + 12
 
 
 def test_point_out_of_view_interrupts_the_track() -> None:
@@ -157,9 +157,7 @@ def test_points_far_outside_do_no_harm() -> None:
     assert (inside[30] != GREY[30]).any(axis=1).all()  # the line crosses the whole picture
 
 
-@pytest.mark.parametrize(
-    "text", ["seed 3", "a caption that is far wider than this small picture"]
-)
+@pytest.mark.parametrize("text", ["seed 3", "a caption that is far wider than this small picture"])
 def test_caption_stays_in_the_lower_left(text: str) -> None:
     drawn = put_caption(GREY, text)
     changed = np.argwhere((drawn != GREY).any(axis=2))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from face_prediction.lifting import CANONICAL_MOUTH, LIPS
+from face_prediction.rigid_pose import rigid_face
 from face_prediction.tracks import NUM_LANDMARKS, FaceTrack
 
 
@@ -54,11 +55,20 @@ def _track(
     offsets[:, lower, 1] = -np.broadcast_to(jaw, frames) / 2
     offsets[:, others] -= offsets[:, others].mean(axis=1, keepdims=True)
     points = mouth[:, None] + np.einsum("tij,tpj->tpi", rotations, offsets)
-    landmarks = np.full((frames, NUM_LANDMARKS, 3), 0.5)
-    landmarks[:, list(LIPS)] = _project(points, image_size)
     pose = np.tile(np.eye(4), (frames, 1, 1))
     pose[:, :3, :3] = rotations
     pose[:, :3, 3] = mouth - rotations @ CANONICAL_MOUTH
+    # the landmarks that the head pose is fitted to where the canonical face has them, every other
+    # one in its mouth, and the relative depth that makes MediaPipe's model of it exact
+    vertices = np.tile(CANONICAL_MOUTH, (NUM_LANDMARKS, 1))
+    rigid = rigid_face()
+    vertices[rigid.weights > 0] = rigid.vertices[rigid.weights > 0]
+    whole = np.einsum("tij,vj->tvi", rotations, vertices) + pose[:, None, :3, 3]
+    whole[:, list(LIPS)] = points
+    landmarks = _project(whole, image_size)
+    depth = -whole[..., 2]
+    view_width = 2 * np.tan(np.radians(63.0 / 2)) * image_size[0] / image_size[1]
+    landmarks[..., 2] = (depth / depth.mean(axis=1, keepdims=True) - 1) / view_width
     landmarks[~valid] = np.nan
     pose[~valid] = np.nan
     opening = np.where(valid, np.broadcast_to(jaw, frames), np.nan)

@@ -12,6 +12,7 @@ from face_prediction.detector import DetectorSettings, FaceDetector
 from face_prediction.face_geometry import head_pose_from_landmarks, read_canonical_face
 from face_prediction.lifting import CANONICAL_MOUTH, LIPS, mouth_centres
 from face_prediction.motion import step_tremor
+from face_prediction.rigid_pose import rigid_face
 from face_prediction.tracks import FaceTrack, load_track
 from face_prediction.video import VideoReader
 
@@ -98,6 +99,10 @@ def test_video_mode_smooths_and_image_mode_does_not(extract) -> None:
 def test_our_pose_is_mediapipes(clips: Path, model: Path) -> None:
     face = read_canonical_face(model)
     np.testing.assert_allclose(face.vertices[list(LIPS)].mean(axis=0), CANONICAL_MOUTH, atol=1e-6)
+    rigid = rigid_face()
+    kept = rigid.weights > 0
+    np.testing.assert_allclose(rigid.vertices[kept], face.vertices[kept], atol=1e-7)
+    np.testing.assert_allclose(rigid.weights[kept], face.weights[kept], atol=1e-6)
     with (
         VideoReader(clips / "lp_s18.mp4") as video,
         FaceDetector(model, DetectorSettings()) as detector,

@@ -16,6 +16,7 @@ from face_prediction.face_geometry import (
     head_pose_from_landmarks,
     read_canonical_face,
 )
+from face_prediction.rigid_pose import rigid_face, rigid_head_poses
 from face_prediction.zoom import (
     Window,
     ZoomingDetector,
@@ -55,6 +56,21 @@ def test_pose_comes_back_from_the_projection(project, image_size, angles) -> Non
     landmarks = seen(face, pose, image_size, project)
     got = head_pose_from_landmarks(landmarks, image_size, face)
     np.testing.assert_allclose(got, pose, atol=1e-9)
+
+
+def test_the_rigid_landmarks_are_above_the_mouth() -> None:
+    face = rigid_face()
+    assert np.count_nonzero(face.weights) == 25
+    assert face.vertices[face.weights > 0, 1].min() > -0.01  # the mouth is at -0.043
+    assert abs(face.weights @ face.vertices[:, 0]) < 1e-9  # as many left as right
+
+
+def test_an_opening_jaw_does_not_bring_the_face_nearer(make_track) -> None:
+    mouth = np.tile([0.0, 0.0, -0.4], (30, 1))
+    track = make_track(mouth, jaw=np.linspace(0.0, 0.03, 30))
+    track.landmarks[:, [132, 136, 361, 365], 1] += np.linspace(0.0, 0.03, 30)[:, None]
+    poses = rigid_head_poses(track.landmarks, track.valid, track.image_size)
+    np.testing.assert_allclose(poses, track.head_pose, atol=1e-9)
 
 
 def test_a_model_that_is_none_is_refused(tmp_path: Path) -> None:

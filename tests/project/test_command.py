@@ -131,9 +131,7 @@ def run(body: str) -> subprocess.CompletedProcess[str]:
         f"def main():\n    {body}\n"
         "run_command(main)\n"
     )
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize(

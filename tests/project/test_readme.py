@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from robo_manip_baselines.expert.feeding import EXPERTS
+from robo_manip_baselines.observation import PRESETS
+
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`([^`\n]+)`")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
@@ -80,6 +83,17 @@ def test_every_option_of_a_command_is_in_its_help(readme: str, repository: Path)
             assert re.search(rf"{option}\b", result.stdout), (words, option)
         checked += 1
     assert checked >= 6
+
+
+def first_column(text: str, heading: str) -> set[str]:
+    """Return the names in backticks that the rows of a table below ``heading`` begin with."""
+    section = text.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+    return set(re.findall(r"^\| `(\w+)`", section, flags=re.MULTILINE))
+
+
+def test_tables_list_what_there_is(readme: str) -> None:
+    assert first_column(readme, "What a policy is shown") == set(PRESETS)
+    assert first_column(readme, "Experts") == set(EXPERTS)
 
 
 @pytest.mark.gl

@@ -41,8 +41,8 @@ _PUPIL_RADIUS: Final = 0.0034
 _EAR_ANGLE: Final = 0.35
 """Ears stand off the head by this much, radians."""
 _SHIRT: Final = (0.23, 0.42, 0.60, 1.0)
-_LINING: Final = (0.30, 0.09, 0.10, 1.0)
-_TONGUE: Final = (0.72, 0.34, 0.36, 1.0)
+_LINING: Final = (0.14, 0.035, 0.04, 1.0)
+_TONGUE: Final = (0.46, 0.19, 0.20, 1.0)
 _TEETH: Final = (0.88, 0.85, 0.78, 1.0)
 _SCLERA: Final = (0.96, 0.95, 0.94, 1.0)
 _IRIS: Final = (0.30, 0.19, 0.11, 1.0)
@@ -73,7 +73,7 @@ def add_face(spec: mujoco.MjSpec) -> None:
     _add_mouth_parts(spec, body["head"], body["jaw"], model)
     _add_mesh(spec, body["head"], "hair", face_mesh.hair(model), _colour(HAIR))
     _add_mesh(spec, body["torso"], "shirt", face_mesh.bust(), _SHIRT)
-    add_collision(body, model)
+    add_collision(spec, body, model)
 
 
 def _colour(rgb: tuple[int, int, int]) -> tuple[float, float, float, float]:

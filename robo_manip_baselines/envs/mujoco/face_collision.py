@@ -46,6 +46,12 @@ _INSIDE: Final[dict[str, Any]] = {
     "friction": (1.0, 0.01, 0.0001),
 }
 
+_CAVITY_MASS: Final = 0.5
+_CAVITY_INERTIA: Final = 5e-4
+"""kg and kg m²: ten times the cube's, so that the cube does not move the mouth."""
+_CAVITY_LAG: Final = 0.004
+"""Time constant of the weld, s: twice the physics step, the stiffest that is stable."""
+
 _LIP_RADIUS: Final = 0.004
 _UPPER_CHAIN: Final = (78, 80, 82, 312, 310, 308)
 _LOWER_CHAIN: Final = (308, 318, 317, 87, 88, 78)
@@ -53,8 +59,8 @@ _LOWER_CHAIN: Final = (308, 318, 317, 87, 88, 78)
 
 _ELLIPSOIDS: Final = (
     # body, name, half axes, centre (head: body frame; jaw and torso: from their own origin)
-    ("head", "skull", (0.100, 0.076, 0.100), (-0.055, 0.0, 0.022)),
-    ("head", "cheeks", (0.060, 0.070, 0.040), (-0.015, 0.0, -0.005)),
+    ("head", "skull", (0.100, 0.076, 0.092), (-0.055, 0.0, 0.030)),
+    ("head", "cheeks", (0.060, 0.070, 0.036), (-0.015, 0.0, 0.000)),
     ("head", "nose", (0.020, 0.013, 0.026), (0.052, 0.0, -0.004)),
     ("jaw", "chin", (0.022, 0.024, 0.012), (0.038, 0.0, -0.072)),
 )
@@ -69,8 +75,15 @@ _MOUTH_BOXES: Final = (
 )
 
 
-def add_collision(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
-    """Add the collision geoms to the bodies ``head``, ``jaw``, ``mouth`` and ``torso``."""
+def add_collision(
+    spec: mujoco.MjSpec, body: Mapping[str, mujoco.MjsBody], model: FaceModel
+) -> None:
+    """Add the collision geoms to the bodies ``head``, ``jaw`` and ``torso``, and a mouth's inside.
+
+    The inside of the mouth is a body of its own that a stiff weld drags after ``face/mouth``.
+    Bodies moved by mocap have no velocity in MuJoCo, so that friction on one would hold a cube
+    fast in the world while the mouth moves away from under it.
+    """
     for owner, name, size, centre in _ELLIPSOIDS:
         body[owner].add_geom(
             name=f"face/{name}",
@@ -81,8 +94,9 @@ def add_collision(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
         )
     _add_neck_and_bust(body)
     _add_lips(body, model)
+    cavity = _add_cavity(spec, body["mouth"])
     for name, size, centre, tilt in _MOUTH_BOXES:
-        body["mouth"].add_geom(
+        cavity.add_geom(
             name=f"face/{name}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=size,
@@ -90,6 +104,31 @@ def add_collision(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
             quat=(np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0),
             **_INSIDE,
         )
+
+
+def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
+    """The body ``face/cavity``, welded to the mocap body ``mouth``."""
+    cavity = spec.worldbody.add_body(
+        name="face/cavity",
+        pos=mouth.pos,
+        quat=mouth.quat,
+        gravcomp=1.0,
+        mass=_CAVITY_MASS,
+        inertia=(_CAVITY_INERTIA,) * 3,
+        explicitinertial=True,
+    )
+    cavity.add_freejoint(name="face/cavity")
+    weld = spec.add_equality(
+        name="face/cavity",
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1=mouth.name,
+        name2=cavity.name,
+        solref=(_CAVITY_LAG, 1.0),
+    )
+    # anchor, relative position and orientation, torque scale (explicit: its default has changed)
+    weld.data[:11] = (0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1)
+    return cavity
 
 
 def _add_neck_and_bust(body: Mapping[str, mujoco.MjsBody]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import mujoco
@@ -189,9 +189,8 @@ class FaceEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
             raise ValueError(
                 f"action of shape {action.shape} must be {self._actuators.shape} finite numbers"
             )
-        self.data.ctrl[self._actuators] = np.clip(
-            action, self.action_space.low, self.action_space.high
-        )
+        low, high = self.model.actuator_ctrlrange[self._actuators].T
+        self.data.ctrl[self._actuators] = np.clip(action, low, high)
         for substep in range(self.substeps):
             self._place_face(substep + 1)
             mujoco.mj_step(self.model, self.data)
@@ -303,6 +302,11 @@ class FaceEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         sign = np.sign(self.model.joint(f"{arm}/right_finger").range.sum())
         self.data.joint(f"{arm}/right_finger").qpos = sign * finger
         self.data.actuator(f"{arm}/gripper").ctrl = finger
+
+
+def world_of(env: gymnasium.Env[Any, Any]) -> FaceEnv:
+    """Return the environment inside Gymnasium's wrappers."""
+    return cast(FaceEnv, env.unwrapped)
 
 
 def _bound(name: str) -> float:

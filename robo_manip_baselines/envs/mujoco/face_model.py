@@ -64,7 +64,8 @@ class FaceModel:
         """
         remedy = "make it with: python -m face_prediction export-surface"
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # opened here: np.load leaves a file that it finds damaged open
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 if str(file["schema"]) != SCHEMA or int(file["version"]) != VERSION:
                     raise RequestError(
                         f"{path}: not a {SCHEMA} file of version {VERSION}; {remedy}"
@@ -103,7 +104,7 @@ class FaceModel:
         Openings outside 0..`MAX_OPENING` are taken as the nearest of the two.
         """
         distance, angle = self._openings
-        return np.asarray(np.interp(np.asarray(jaw, float), distance, angle))
+        return np.asarray(np.interp(np.clip(jaw, 0.0, MAX_OPENING), distance, angle))
 
     @cached_property
     def _openings(self) -> tuple[Floats, Floats]:

@@ -70,7 +70,7 @@ def build_cell() -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "vx300s_cell"
     spec.compiler.degree = False
-    _set_options(spec.option)
+    _set_options(spec)
     _set_visual(spec)
     _add_room(spec)
     for arm in ARM_BASES:
@@ -126,14 +126,15 @@ def look_at(position: Sequence[float], target: Sequence[float]) -> np.ndarray:
     return quat
 
 
-def _set_options(option: mujoco.MjOption) -> None:
+def _set_options(spec: mujoco.MjSpec) -> None:
     """Set every option that matters, so that no release's defaults decide for us.
 
     (The cell has no weld; whoever adds one should state its ``torquescale``, which releases have
     changed too.)
     """
+    option = spec.option
     option.timestep = TIMESTEP
-    option.gravity = (0.0, 0.0, -9.81)
+    option.gravity[:] = (0.0, 0.0, -9.81)
     # Implicit in the servos' velocity feedback: stable at 2 ms with stiff, well damped servos.
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Elliptic cones with friction stiffer than the normal direction keep a held cube from creeping.
@@ -171,12 +172,12 @@ def _set_visual(spec: mujoco.MjSpec) -> None:
     visual.quality.numslices = 16
     visual.quality.numstacks = 4
     visual.quality.numquads = 1
-    visual.headlight.ambient = (0.38, 0.38, 0.38)
-    visual.headlight.diffuse = (0.30, 0.30, 0.30)
-    visual.headlight.specular = (0.0, 0.0, 0.0)
+    visual.headlight.ambient[:] = (0.38, 0.38, 0.38)
+    visual.headlight.diffuse[:] = (0.30, 0.30, 0.30)
+    visual.headlight.specular[:] = (0.0, 0.0, 0.0)
     visual.map.znear = 0.01  # times the scene's extent
     visual.map.zfar = 8.0
-    spec.stat.center = (0.0, BASE_Y, 0.2)
+    spec.stat.center[:] = (0.0, BASE_Y, 0.2)
     spec.stat.extent = 1.0
 
 
@@ -213,9 +214,9 @@ def _add_room(spec: mujoco.MjSpec) -> None:
     # A floor and three walls: all that is seen behind the table.
     for name, size, position in (
         ("floor", (3.0, 3.0, 0.01), (0, BASE_Y, -_TABLE_HEIGHT - 0.01)),
-        ("wall_back", (3.0, 0.01, 2.0), (0, BASE_Y + 3.0, 2.0 - _TABLE_HEIGHT)),
-        ("wall_left", (0.01, 3.0, 2.0), (-3.0, BASE_Y, 2.0 - _TABLE_HEIGHT)),
-        ("wall_right", (0.01, 3.0, 2.0), (3.0, BASE_Y, 2.0 - _TABLE_HEIGHT)),
+        ("wall_back", (3.0, 0.01, 3.0), (0, BASE_Y + 3.0, 3.0 - _TABLE_HEIGHT)),
+        ("wall_left", (0.01, 3.0, 3.0), (-3.0, BASE_Y, 3.0 - _TABLE_HEIGHT)),
+        ("wall_right", (0.01, 3.0, 3.0), (3.0, BASE_Y, 3.0 - _TABLE_HEIGHT)),
     ):
         world.add_geom(
             name=name,
@@ -234,17 +235,20 @@ def _add_room(spec: mujoco.MjSpec) -> None:
     ):
         world.add_light(
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            pos=np.array([0, BASE_Y, 0.2]) - 2.0 * np.array(direction),
+            pos=(np.array([0, BASE_Y, 0.2]) - 2.0 * np.array(direction)).tolist(),
             dir=direction,
             diffuse=(diffuse, diffuse, diffuse),
             specular=(0.2, 0.2, 0.2) if shadow else (0, 0, 0),
             castshadow=shadow,
         )
-    # front_close sees the mouth from 0.58 m, from the side of the arm that does not feed and
-    # from its own height: from above, pitching heads hide their mouths from a detector.
+    # front_close sees the mouth from 0.58 m, 32 degrees to the side and 12 below it, a compromise:
+    # nearer to the arm's own line, or from its height, gripper and cube hide the mouth earlier;
+    # further to the side, or from above, a detector loses heads that turn or nod.
     for name, position, target, fovy in (
         ("top", (0.08, BASE_Y, 1.15), (0.08, BASE_Y, 0.0), 48.0),
         ("angle", (0.60, -0.35, 0.72), (0.10, BASE_Y, 0.18), 45.0),
-        ("front_close", (0.444, BASE_Y - 0.373, 0.35), (0.0, BASE_Y, 0.35), FRONT_CLOSE_FOVY),
+        ("front_close", (0.481, BASE_Y - 0.301, 0.229), (0.0, BASE_Y, 0.35), FRONT_CLOSE_FOVY),
     ):
-        world.add_camera(name=name, pos=position, quat=look_at(position, target), fovy=fovy)
+        world.add_camera(
+            name=name, pos=position, quat=look_at(position, target).tolist(), fovy=fovy
+        )

@@ -1,0 +1,122 @@
+"""How well the scripted experts feed: outcomes, forces and slip, expert by expert, clip by clip.
+
+Example: python benchmarks/experts.py --num_episodes 50
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mink
+import numpy as np
+
+from robo_manip_baselines.command import parse, run_command
+from robo_manip_baselines.envs.mujoco.feeding_env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.feeding_success import Phase
+from robo_manip_baselines.envs.mujoco.registration import make_env
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.expert.feeding import EXPERTS, FeedingExpert
+
+
+@dataclass(frozen=True)
+class Options:
+    """Play episodes with every scripted expert and print what came of them."""
+
+    num_episodes: int = 50
+    """Episodes of each expert, one for each seed from --seed on."""
+    seed: int = 0
+    """Seed of the first episode."""
+    face_motion: str = "episode"
+    """episode or after_lift."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One episode.
+
+    Attributes:
+        clip: whose motion it was.
+        is_success, is_success_strict: as in ``info``.
+        completion_time: s; NaN without success.
+        slip: m, how far the cube moved in the gripper while it was carried.
+        force: N, largest between robot and face.
+    """
+
+    seed: int
+    clip: str
+    is_success: bool
+    is_success_strict: bool
+    completion_time: float
+    slip: float
+    force: float
+
+
+def play(world: FeedingEnv, expert: str, seed: int) -> Outcome:
+    """Play one episode."""
+    actor = FeedingExpert(world, EXPERTS[expert])
+    world.reset(seed=seed)
+    actor.reset()
+    force, carried = 0.0, []
+    for _ in range(600):
+        _, _, terminated, _, info = world.step(actor.act())
+        force = max(force, info["face_force"])
+        if world.progress.phase is Phase.CARRY:
+            gripper = mink.SO3(world.gripper_orientation)
+            carried.append(
+                gripper.inverse().apply(world.object_position() - world.gripper_position)
+            )
+        if terminated:
+            break
+    time = world.progress.completion_time
+    return Outcome(
+        seed=seed,
+        clip=world.segment.clip,
+        is_success=world.progress.is_success,
+        is_success_strict=world.progress.is_success_strict,
+        completion_time=np.nan if time is None else time,
+        slip=float(np.ptp(carried, axis=0).max()) if carried else np.nan,
+        force=force,
+    )
+
+
+def table(name: str, outcomes: dict[str, list[Outcome]]) -> Iterator[str]:
+    """Lay outcomes out as Markdown, a row for each group."""
+    yield f"| {name} | success | strict | completion time (s) | slip (mm) | force (N) | failed |"
+    yield "|---|---|---|---|---|---|---|"
+    for group, played in outcomes.items():
+        n = len(played)
+        times = [outcome.completion_time for outcome in played if outcome.is_success]
+        slips = [1e3 * outcome.slip for outcome in played]
+        forces = [outcome.force for outcome in played]
+        failed = ", ".join(str(outcome.seed) for outcome in played if not outcome.is_success)
+        yield (
+            f"| {group} | {sum(o.is_success for o in played)}/{n} "
+            f"| {sum(o.is_success_strict for o in played)}/{n} "
+            f"| {np.mean(times):.2f} ± {np.std(times, ddof=min(1, len(times) - 1)):.2f} "
+            f"| {np.median(slips):.1f}, at most {np.max(slips):.1f} "
+            f"| {np.median(forces):.1f}, at most {np.max(forces):.1f} | {failed or '–'} |"
+        )
+
+
+def main() -> None:
+    """Play and print."""
+    options: Options = parse(Options, "python benchmarks/experts.py --num_episodes 50")
+    if options.num_episodes < 1:
+        raise RequestError(f"num_episodes {options.num_episodes}: must be 1 or more")
+    env = make_env("FeedingEnv", cameras=(), face_motion=options.face_motion)
+    assert isinstance(env.unwrapped, FeedingEnv)
+    seeds = range(options.seed, options.seed + options.num_episodes)
+    by_expert = {
+        expert: [play(env.unwrapped, expert, seed) for seed in seeds] for expert in EXPERTS
+    }
+    env.close()
+    print("\n".join(table("expert", by_expert)), end="\n\n")
+    for expert, outcomes in by_expert.items():
+        clips = sorted({outcome.clip for outcome in outcomes})
+        by_clip = {clip: [o for o in outcomes if o.clip == clip] for clip in clips}
+        print("\n".join(table(f"{expert}, by clip", by_clip)), end="\n\n")
+
+
+if __name__ == "__main__":
+    run_command(main)
