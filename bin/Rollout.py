@@ -1,11 +1,13 @@
 """Let an expert act in an environment and record its episodes."""
 
 from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.expert.rollout_command import EXAMPLE, RolloutOptions, rollout
 
 
 def main() -> None:
     """Read the command line and roll out."""
+    # Imported here, so that run_command can say what is wrong if MuJoCo's backend is missing.
+    from robo_manip_baselines.expert.rollout_command import EXAMPLE, RolloutOptions, rollout
+
     rollout(parse(RolloutOptions, EXAMPLE))
 
 

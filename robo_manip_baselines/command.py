@@ -22,6 +22,7 @@ from typing import Any, NoReturn, TypeVar, cast, overload
 import tyro
 
 from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.opengl_check import opengl_problem
 
 Options = TypeVar("Options")
 
@@ -81,8 +82,11 @@ def run_command(main: Callable[[], int | None]) -> NoReturn:
             traceback.print_exc()
         code = EXIT_FAILED
     except Exception:
-        traceback.print_exc()
-        code = EXIT_FAILED
+        if problem := _backend_problem():
+            code = _say(f"error: {problem}", EXIT_WRONG_REQUEST)
+        else:
+            traceback.print_exc()
+            code = EXIT_FAILED
     if _is_reader_gone():
         # As in `… | head`: what Python would still flush has no reader; an error about it helps
         # nobody.
@@ -206,6 +210,14 @@ def _box_to_line(text: str) -> str:
     for pattern, plain in _PLAINER:
         message = re.sub(pattern, plain, message)
     return message
+
+
+def _backend_problem() -> str | None:
+    """Say why MuJoCo could not even be imported with the backend that ``$MUJOCO_GL`` names."""
+    if "mujoco" in sys.modules or not os.environ.get("MUJOCO_GL"):
+        return None
+    problem = opengl_problem()
+    return problem and f"{problem} (or unset MUJOCO_GL: --cameras none --preview 0 needs no OpenGL)"
 
 
 def _help_hint() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.evaluation.preview import write_preview
 from robo_manip_baselines.expert.collect import Collection, Summary, collect
 from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.opengl_check import opengl_problem
+
+logger = logging.getLogger(__name__)
 
 PREVIEW = "preview.mp4"
 
@@ -66,8 +70,12 @@ def rollout(options: RolloutOptions) -> None:
     if options.preview < 0:
         raise RequestError(f"preview {options.preview}: must be 0 or more episodes")
     collection = to_collection(options)
+    shown = options.preview
+    if shown and not collection.env_kwargs["cameras"] and (problem := opengl_problem()):
+        logger.warning("no preview video: %s", problem)
+        shown = 0
     summary = collect(collection)
-    episodes = list_episodes(collection.out)[: options.preview]
+    episodes = list_episodes(collection.out)[:shown]
     video = collection.out / PREVIEW if episodes else None
     if video:
         write_preview(video, episodes)

@@ -185,7 +185,6 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
         ({"face_motion": "never"}, "unknown face motion 'never'"),
         ({"clips": ("nobody",)}, "unknown clip 'nobody'"),
         ({"motion_library": "nowhere.npz"}, "'nowhere.npz' does not exist"),
-        ({"render_mode": "ansi"}, "unknown render mode 'ansi'"),
     ],
 )
 def test_bad_arguments_get_one_clear_line(

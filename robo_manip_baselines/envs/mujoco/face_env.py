@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import gymnasium
 import mujoco
@@ -53,14 +53,14 @@ _BOUNDS = {
 _LENGTH_BOUND = 5.0
 
 
-class FaceEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
+class FaceEnv(gymnasium.Env[Any, Any]):
     """A cell with two arms and a head that moves as a recorded person moved.
 
     A task derives from it: it adds its objects to the scene, draws their start, and says after
     each step what has been achieved.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 (the name and its kind are Gymnasium's)
         "render_modes": ["rgb_array"],
         "render_fps": round(1.0 / CONTROL_PERIOD),
     }
