@@ -187,7 +187,7 @@ def save(path: Path, image: NDArray[np.uint8]) -> None:
 
 def main() -> None:
     """Measure, print, draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Find the drawn face with MediaPipe.")
     parser.add_argument("--model", type=Path, required=True, help="face_landmarker.task")
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)

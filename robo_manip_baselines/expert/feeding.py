@@ -136,7 +136,7 @@ def _phases(config: FeedingExpertConfig, home: Command) -> list[Phase]:
         Reach(grasp, speed=0.15),
         Grip(FINGER_CLOSED, 0.4),
         Reach(lifted, speed=0.2),
-        Reach(standoff),
+        Reach(standoff, least_duration=1.2),
         # Phase 2: move towards the mouth.
         Approach(lead=lead),
         # Phase 3: insert the cube into the mouth, let go, retract.

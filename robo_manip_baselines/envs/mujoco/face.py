@@ -61,7 +61,7 @@ def add_face(spec: mujoco.MjSpec) -> None:
     rest = model.body_poses(_NOMINAL_MOUTH, (1, 0, 0, 0), REST_OPENING)
     body = {
         name.removeprefix("face/"): spec.worldbody.add_body(
-            name=name, mocap=True, pos=at, quat=turn
+            name=name, mocap=True, pos=at.tolist(), quat=turn.tolist()
         )
         for name, (at, turn) in rest.items()
     }

@@ -110,8 +110,8 @@ def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
     """The body ``face/cavity``, welded to the mocap body ``mouth``."""
     cavity = spec.worldbody.add_body(
         name="face/cavity",
-        pos=mouth.pos,
-        quat=mouth.quat,
+        pos=mouth.pos.tolist(),
+        quat=mouth.quat.tolist(),
         gravcomp=1.0,
         mass=_CAVITY_MASS,
         inertia=(_CAVITY_INERTIA,) * 3,
@@ -179,7 +179,7 @@ def _add_lips(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
                 name=f"face/lip_{count}",
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
                 size=(_LIP_RADIUS, 0, 0),
-                fromto=np.concatenate([start, end]),
+                fromto=[*start.tolist(), *end.tolist()],
                 **_OUTSIDE,
             )
             count += 1

@@ -168,7 +168,7 @@ def _set_visual(spec: mujoco.MjSpec) -> None:
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = 1280, 960
     visual.quality.offsamples = 0
-    visual.quality.shadowsize = 2048
+    visual.quality.shadowsize = 1024
     visual.quality.numslices = 16
     visual.quality.numstacks = 4
     visual.quality.numquads = 1
