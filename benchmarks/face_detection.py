@@ -25,16 +25,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
+from robo_manip_baselines.envs.mujoco.face_env import FACE_OFFSET, PARKED_QPOS
 from robo_manip_baselines.envs.mujoco.motion import SEGMENT_DURATION, MotionLibrary
-from robo_manip_baselines.envs.mujoco.scene import build_cell
+from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.vx300s import ARM_JOINTS, HOME_QPOS
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA, WIDTH, HEIGHT = "front_close", 640, 480
-MOUTH = np.array([0.0, 0.5, 0.35])
-OFFSET = 0.05
+MOUTH = np.array(MOUTH_BASE)
 CENTRE = np.array([-0.03, 0.0, 0.03])  # of the face, from the mouth
-PARKED_QPOS = (0.0, -1.8, 1.55, 0.0, -1.2, 0.0)
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ def recorded_views(count: int, seed: int) -> Iterator[View]:
             clips = sorted(set(library.run_clip))
             segment = library.draw(rng, clips=[clips[index % len(clips)]])
             moved, orientation, jaw = segment.at(rng.uniform(0.0, SEGMENT_DURATION))
-            mouth = MOUTH + rng.uniform(-OFFSET, OFFSET, 3) + moved
+            mouth = MOUTH + rng.uniform(-FACE_OFFSET, FACE_OFFSET, 3) + moved
             place_face(model, data, mouth, orientation, float(jaw) + REST_OPENING)
             renderer.update_scene(data, CAMERA)
             yield View(

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from robo_manip_baselines.envs.mujoco.face_env import FACE_OFFSET, MOUTH_BASE
+from robo_manip_baselines.envs.mujoco.face_env import FACE_OFFSET
 from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.envs.mujoco.scene import build_cell
+from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.vx300s import ARM_JOINTS, HOME_QPOS, JOINT_LIMITS
 from robo_manip_baselines.expert.feeding import STANDOFF
 from robo_manip_baselines.expert.kinematics import (

@@ -19,7 +19,7 @@ from robo_manip_baselines.envs.mujoco.motion import (
 )
 from robo_manip_baselines.envs.mujoco.rendering import CameraRenderer
 from robo_manip_baselines.envs.mujoco.replay import FACE_MOTIONS, FaceReplay
-from robo_manip_baselines.envs.mujoco.scene import build_cell
+from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.vx300s import (
     ARM_JOINTS,
     FINGER_CLOSED,
@@ -32,17 +32,14 @@ from robo_manip_baselines.observation import ObservationSpec, Truth, observe
 CONTROL_PERIOD = 0.02
 """s between two actions (paper, Algorithm 1, line 2)."""
 
-MOUTH_BASE = np.array([0.0, 0.5, 0.35])
-"""m, world: the mouth before its random offset. Every corner of +-0.1 m around it is within reach
-of the right arm with a level gripper."""
-
 FACE_OFFSET = 0.05
 """m, largest random offset of the face along each axis (paper, Algorithm 1, line 3)."""
 
 PARKED_QPOS = (0.0, -1.8, 1.55, 0.0, -1.2, 0.0)
-"""rad, the folded left arm (the sleep pose of the arm's maker, gripper tucked in)."""
+"""rad, the left arm folded back over its base, out of the head's way."""
 
 RENDER_CAMERA = "angle"
+"""What ``render()`` shows."""
 
 # Wide enough for whatever physics may do; observations are not clipped to them.
 _BOUNDS = {
@@ -175,6 +172,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
         self.reset_objects(self.np_random)
         self._place_face(0)
+        position, orientation = self.replay.bodies["face/mouth"]
+        self.data.joint("face/cavity").qpos = (*position[0], *orientation[0])
         mujoco.mj_forward(self.model, self.data)
         return self.observe(), {}
 

@@ -28,6 +28,10 @@ ARM_BASES: Final = {
 }
 """Position (m) and orientation (wxyz) of each arm's base, world frame."""
 
+MOUTH_BASE: Final = (0.0, BASE_Y, 0.35)
+"""m, world: where the mouth of a head that looks along +x is before any random offset. A level
+gripper of the right arm reaches every place around it that recorded motion leads to."""
+
 CUBE_SIZE: Final = 0.04
 """Edge of the cube, metres."""
 
@@ -247,7 +251,7 @@ def _add_room(spec: mujoco.MjSpec) -> None:
     for name, position, target, fovy in (
         ("top", (0.08, BASE_Y, 1.15), (0.08, BASE_Y, 0.0), 48.0),
         ("angle", (0.60, -0.35, 0.72), (0.10, BASE_Y, 0.18), 45.0),
-        ("front_close", (0.481, BASE_Y - 0.301, 0.229), (0.0, BASE_Y, 0.35), FRONT_CLOSE_FOVY),
+        ("front_close", (0.481, BASE_Y - 0.301, 0.229), MOUTH_BASE, FRONT_CLOSE_FOVY),
     ):
         world.add_camera(
             name=name, pos=position, quat=look_at(position, target).tolist(), fovy=fovy

@@ -20,7 +20,7 @@ from robo_manip_baselines.errors import RequestError
 Floats = NDArray[np.float64]
 Poses = dict[str, tuple[Floats, Floats]]
 
-SURFACE = Path(__file__).parent / "assets" / "face_surface.npz"
+SURFACE = Path(__file__).parents[1] / "assets" / "face_surface.npz"
 SCHEMA, VERSION = "face_surface", 1
 
 REST_OPENING = 0.030

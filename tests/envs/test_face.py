@@ -26,9 +26,9 @@ from robo_manip_baselines.envs.mujoco.face import (
     FaceModel,
     add_face,
 )
-from robo_manip_baselines.envs.mujoco.face_mesh import face_oval, head
-from robo_manip_baselines.envs.mujoco.face_model import SURFACE
-from robo_manip_baselines.envs.mujoco.face_texture import encode_png, paint
+from robo_manip_baselines.envs.mujoco.face.mesh import face_oval, head
+from robo_manip_baselines.envs.mujoco.face.model import SURFACE
+from robo_manip_baselines.envs.mujoco.face.texture import encode_png, paint
 from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
 from robo_manip_baselines.errors import RequestError
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.face_model import FaceModel
+from robo_manip_baselines.envs.mujoco.face.model import FaceModel
 
 Floats = NDArray[np.float64]
 

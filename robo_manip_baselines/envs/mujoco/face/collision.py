@@ -1,7 +1,7 @@
 """What of the face can be touched: its outside by robots, the inside of its mouth by the cube.
 
-Contact bits: the outside (contype 2) meets robots only, never the cube, because soft lips give
-way to food; the inside of the mouth (contype 4) meets the cube only, and holds it once released.
+Contact bits: the outside (`FACE`) meets robots only, never the cube, because soft lips give way to
+food; the inside of the mouth (`MOUTH`) meets the cube only, and holds it once released.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.face_model import (
+from robo_manip_baselines.envs.mujoco.face.model import (
     REST_OPENING,
     FaceModel,
     hinge_quaternion,
     rotate,
 )
+from robo_manip_baselines.envs.mujoco.scene import FACE, MOUTH
 
 _HIDDEN: Final[dict[str, Any]] = {
     "mass": 0,
@@ -36,13 +37,13 @@ _SOFT: Final[dict[str, Any]] = {
 _OUTSIDE: Final[dict[str, Any]] = {
     **_HIDDEN,
     **_SOFT,
-    "contype": 2,
+    "contype": FACE,
     "friction": (0.3, 0.005, 0.0001),
 }
 _INSIDE: Final[dict[str, Any]] = {
     **_HIDDEN,
     **_SOFT,
-    "contype": 4,
+    "contype": MOUTH,
     "friction": (1.0, 0.01, 0.0001),
 }
 

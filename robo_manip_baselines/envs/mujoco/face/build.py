@@ -1,7 +1,7 @@
 """Put the face into a MuJoCo cell: bodies, skins, collision geoms and the site ``mouth``.
 
-The shape and its kinematics are in `face_model`, the surfaces around the measured one in
-`face_mesh`, the colours in `face_texture`.
+The shape and its kinematics are in `model`, the surfaces around the measured one in `mesh`, the
+colours in `texture`, what can be touched in `collision`.
 """
 
 from __future__ import annotations
@@ -11,28 +11,22 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco import face_mesh
-from robo_manip_baselines.envs.mujoco.face_collision import add_collision
-from robo_manip_baselines.envs.mujoco.face_mesh import Floats, Surface
-from robo_manip_baselines.envs.mujoco.face_model import (
-    MAX_OPENING,
-    REST_OPENING,
-    FaceModel,
-)
-from robo_manip_baselines.envs.mujoco.face_texture import (
+from robo_manip_baselines.envs.mujoco.face import mesh
+from robo_manip_baselines.envs.mujoco.face.collision import add_collision
+from robo_manip_baselines.envs.mujoco.face.mesh import Floats, Surface
+from robo_manip_baselines.envs.mujoco.face.model import REST_OPENING, FaceModel
+from robo_manip_baselines.envs.mujoco.face.texture import (
     HAIR,
     SKIN,
     encode_png,
     paint,
     texture_coordinates,
 )
-
-__all__ = ["BODIES", "MAX_OPENING", "REST_OPENING", "FaceModel", "add_face"]
+from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE
 
 BODIES: Final = ("face/head", "face/jaw", "face/mouth", "face/torso")
 """Mocap bodies, children of the world: the keys of `FaceModel.body_poses`."""
 
-_NOMINAL_MOUTH: Final = (0.0, 0.5, 0.35)
 _TEXTURE_FILE: Final = "face_texture.png"
 
 _EYE_RADIUS: Final = 0.0122
@@ -58,7 +52,7 @@ def add_face(spec: mujoco.MjSpec) -> None:
     geoms named ``face/...``. Move it with `FaceModel.body_poses`.
     """
     model = FaceModel.load()
-    rest = model.body_poses(_NOMINAL_MOUTH, (1, 0, 0, 0), REST_OPENING)
+    rest = model.body_poses(MOUTH_BASE, (1, 0, 0, 0), REST_OPENING)
     body = {
         name.removeprefix("face/"): spec.worldbody.add_body(
             name=name, mocap=True, pos=at.tolist(), quat=turn.tolist()
@@ -71,8 +65,8 @@ def add_face(spec: mujoco.MjSpec) -> None:
     _add_eyes(body["head"], model)
     _add_ears(body["head"])
     _add_mouth_parts(spec, body["head"], body["jaw"], model)
-    _add_mesh(spec, body["head"], "hair", face_mesh.hair(model), _colour(HAIR))
-    _add_mesh(spec, body["torso"], "shirt", face_mesh.bust(), _SHIRT)
+    _add_mesh(spec, body["head"], "hair", mesh.hair(model), _colour(HAIR))
+    _add_mesh(spec, body["torso"], "shirt", mesh.bust(), _SHIRT)
     add_collision(spec, body, model)
 
 
@@ -91,11 +85,11 @@ def _add_materials(spec: mujoco.MjSpec) -> None:
 
 def _add_skins(spec: mujoco.MjSpec, model: FaceModel) -> None:
     jaw = ("face/jaw", model.hinge)
-    _add_skin(spec, "face/skin", face_mesh.head(model), jaw, "face/skin")
-    _add_skin(spec, "face/lining", face_mesh.mouth_lining(model), jaw, "face/lining")
+    _add_skin(spec, "face/skin", mesh.head(model), jaw, "face/skin")
+    _add_skin(spec, "face/lining", mesh.mouth_lining(model), jaw, "face/lining")
     mouth = model.lip_centre(model.jaw_angle(REST_OPENING))
     collar = mouth + np.array([-0.125, 0.0, -0.135])
-    tube = face_mesh.neck(np.array([-0.068, 0.0, -0.040]), collar)
+    tube = mesh.neck(np.array([-0.068, 0.0, -0.040]), collar)
     _add_skin(spec, "face/neck", tube, ("face/torso", mouth), "face/skin")
 
 
@@ -170,10 +164,10 @@ def _add_mouth_parts(
     spec: mujoco.MjSpec, head: mujoco.MjsBody, jaw: mujoco.MjsBody, model: FaceModel
 ) -> None:
     lips = model.vertices[model.rings["lips_inner"]].mean(axis=0)
-    upper = face_mesh.teeth(lips + np.array([-0.004, 0.0, 0.008]), -0.009)
+    upper = mesh.teeth(lips + np.array([-0.004, 0.0, 0.008]), -0.009)
     # the lower arch is smaller and bites behind the upper one
     foot = lips + np.array([-0.006, 0.0, -0.011]) - model.hinge
-    lower = face_mesh.teeth(foot, 0.008, 0.019, 0.024)
+    lower = mesh.teeth(foot, 0.008, 0.019, 0.024)
     _add_mesh(spec, head, "teeth_upper", upper, _TEETH)
     _add_mesh(spec, jaw, "teeth_lower", lower, _TEETH)
     jaw.add_geom(

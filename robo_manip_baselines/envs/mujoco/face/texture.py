@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.face_model import FaceModel
+from robo_manip_baselines.envs.mujoco.face.model import FaceModel
 
 Floats = NDArray[np.float64]
 
