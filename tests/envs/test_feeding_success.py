@@ -186,5 +186,5 @@ def test_there_are_no_times_before_the_events() -> None:
 
 def test_clear_needs_the_release_first() -> None:
     assert not play(LIFTED, replace(LIFTED, gripper_distance=1.0)).is_clear
-    assert not play(LIFTED, LET_GO, replace(CLEAR, gripper_distance=0.0799)).is_clear
+    assert not play(LIFTED, LET_GO, replace(CLEAR, gripper_distance=0.1199)).is_clear
     assert play(LIFTED, LET_GO, CLEAR, LET_GO).is_clear

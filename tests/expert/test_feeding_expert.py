@@ -11,6 +11,7 @@ import pytest
 from robo_manip_baselines.envs.mujoco.feeding_env import FeedingEnv
 from robo_manip_baselines.envs.mujoco.feeding_success import Phase, Progress
 from robo_manip_baselines.envs.mujoco.registration import make_env
+from robo_manip_baselines.envs.mujoco.scene import MOUTH
 from robo_manip_baselines.expert.feeding import EXPERTS, FeedingExpert
 
 
@@ -28,15 +29,22 @@ def cube_in_gripper(world: FeedingEnv) -> np.ndarray:
     return gripper.inverse().apply(world.object_position() - world.gripper_position)
 
 
+def cube_touches_face(world: FeedingEnv) -> bool:
+    """Whether the inside of the mouth pushes on the cube."""
+    inside = world.model.geom_contype == MOUTH
+    return bool(inside[world.data.contact.geom].any())
+
+
 def feed(world: FeedingEnv, expert: str, seed: int) -> tuple[Progress, list[np.ndarray]]:
-    """Play an episode; return how it went, and the cube in the gripper while it was carried."""
+    """Play an episode; return how it went, and the cube in the gripper while only that held it."""
     actor = FeedingExpert(world, EXPERTS[expert])
     world.reset(seed=seed)
     actor.reset()
-    carried = []
+    carried, touched = [], False
     for _ in range(600):
         _, _, terminated, _, _ = world.step(actor.act())
-        if world.progress.phase is Phase.CARRY:
+        touched = touched or cube_touches_face(world)
+        if world.progress.phase is Phase.CARRY and not touched:
             carried.append(cube_in_gripper(world))
         if terminated:
             break
@@ -87,6 +95,5 @@ def test_at_least_48_of_50_episodes_succeed(expert: str) -> None:
     env.close()
     failed = [seed for seed, (progress, _) in enumerate(outcomes) if not progress.is_success]
     assert len(failed) <= 2, failed
-    # From the lift to the lips, nothing but the gripper holds the cube.
     slips = [np.ptp(carried, axis=0).max() for _, carried in outcomes]
-    assert np.median(slips) < 1e-3  # m
+    assert max(slips) < 2e-3  # m, from the lift to the lips

@@ -103,7 +103,7 @@ class FeedingEnv(FaceEnv):
     ## Episode end
 
     Terminates when the cube was delivered (``is_success``) and let go and the gripper has
-    withdrawn by 0.08 m, or when the cube falls off the table. Truncated after 600 steps (12 s).
+    withdrawn by 0.12 m, or when the cube falls off the table. Truncated after 600 steps (12 s).
 
     ## Arguments
 

@@ -22,8 +22,8 @@ CAVITY_DEPTH = 0.05
 """m behind the lips within which a released cube is in the mouth; a cube longer in than this would
 be in the throat."""
 
-CLEAR_DISTANCE = 0.08
-"""m between gripper and mouth from which the gripper has withdrawn: two cube sizes."""
+CLEAR_DISTANCE = 0.12
+"""m between gripper and mouth from which the gripper has withdrawn: three cube sizes."""
 
 
 class Phase(enum.IntEnum):

@@ -1,0 +1,25 @@
+"""Draws the README's picture: ``python docs/images/draw_demo.py``, after ``make demo``."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import cv2
+
+from robo_manip_baselines.command import run_command
+from robo_manip_baselines.evaluation.preview import preview_frames
+
+EPISODE = Path("dataset/FeedingEnv_demo/episode_000000.hdf5")
+FRAME = 150  # 6 s, on the way to the mouth
+
+
+def main() -> None:
+    frame = next(islice(preview_frames(EPISODE), FRAME, None))
+    path = Path(__file__).parent / "demo.png"
+    cv2.imwrite(str(path), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    print(path)
+
+
+if __name__ == "__main__":
+    run_command(main)
