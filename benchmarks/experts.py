@@ -38,6 +38,8 @@ class Outcome:
     Attributes:
         clip: whose motion it was.
         is_success, is_success_strict: as in ``info``.
+        touched_face: the gripper touched lips or face after the lift.
+        released_inside: the cube was let go in the mouth.
         completion_time: s; NaN without success.
         slip: m, how far the cube moved in the gripper while it was carried.
         force: N, largest between robot and face.
@@ -47,6 +49,8 @@ class Outcome:
     clip: str
     is_success: bool
     is_success_strict: bool
+    touched_face: bool
+    released_inside: bool
     completion_time: float
     slip: float
     force: float
@@ -74,6 +78,8 @@ def play(world: FeedingEnv, expert: str, seed: int) -> Outcome:
         clip=world.segment.clip,
         is_success=world.progress.is_success,
         is_success_strict=world.progress.is_success_strict,
+        touched_face=world.progress.touched_face,
+        released_inside=world.progress.released_inside,
         completion_time=np.nan if time is None else time,
         slip=float(np.ptp(carried, axis=0).max()) if carried else np.nan,
         force=force,
@@ -82,8 +88,10 @@ def play(world: FeedingEnv, expert: str, seed: int) -> Outcome:
 
 def table(name: str, outcomes: dict[str, list[Outcome]]) -> Iterator[str]:
     """Lay outcomes out as Markdown, a row for each group."""
-    yield f"| {name} | success | strict | completion time (s) | slip (mm) | force (N) | failed |"
-    yield "|---|---|---|---|---|---|---|"
+    heads = [name, "success", "strict", "touched face", "let go outside", "completion time (s)"]
+    heads += ["slip (mm)", "force (N)", "failed"]
+    yield f"| {' | '.join(heads)} |"
+    yield "|---" * len(heads) + "|"
     for group, played in outcomes.items():
         n = len(played)
         times = [outcome.completion_time for outcome in played if outcome.is_success]
@@ -93,6 +101,8 @@ def table(name: str, outcomes: dict[str, list[Outcome]]) -> Iterator[str]:
         yield (
             f"| {group} | {sum(o.is_success for o in played)}/{n} "
             f"| {sum(o.is_success_strict for o in played)}/{n} "
+            f"| {sum(o.touched_face for o in played)} "
+            f"| {sum(not o.released_inside for o in played)} "
             f"| {np.mean(times):.2f} ± {np.std(times, ddof=min(1, len(times) - 1)):.2f} "
             f"| {np.median(slips):.1f}, at most {np.max(slips):.1f} "
             f"| {np.median(forces):.1f}, at most {np.max(forces):.1f} | {failed or '–'} |"

@@ -4,7 +4,7 @@ Recorded poses from every run of the shipped motion library, at base offsets of 
 rendered at 640×480 with the arms at their start; the mouth's centre (mean of the 40 lip landmarks)
 is compared with the projected truth. Needs OpenGL, MediaPipe and its model file::
 
-    python benchmarks/face_detection.py --model ../shared/faces/face_landmarker.task
+    python benchmarks/face_detection.py --model face_landmarker.task
 
 prints a table and writes docs/images/face_*.png.
 """

@@ -35,7 +35,7 @@ from robo_manip_baselines.errors import RequestError
 MOUTH = np.array([0.0, 0.5, 0.35])
 ABOVE = np.array([0.0, 0.0, 0.03])
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-# Seam 3 of the recorded motion: head x -> world y, head y -> world z, head z -> world x.
+# The frame of the recorded motion: head x -> world y, head y -> world z, head z -> world x.
 WORLD_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
@@ -201,7 +201,7 @@ def test_lip_centre_is_where_it_was_asked_for(
     with np.load(SURFACE, allow_pickle=False) as file:
         vertices, weight, hinge = file["vertices"], file["jaw_weight"], file["jaw_hinge"]
         lips = np.concatenate([file["lips_outer"], file["lips_inner"]])
-    # bones carry the vertices, in the head's axes, through the bodies' own axes (seam 3)
+    # bones carry the vertices, in the head's axes, through the bodies' own axes
     carried = []
     for name, origin in (("face/head", np.zeros(3)), ("face/jaw", hinge)):
         at, quat = poses[name]

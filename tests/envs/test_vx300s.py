@@ -150,7 +150,7 @@ def test_gripper_pose_agrees_with_the_published_chain(model: mujoco.MjModel, arm
         mujoco.mj_kinematics(model, data)
         site = data.site(f"{arm}/gripper")
         position, orientation = published_gripper(angles, base)
-        # The issue asks for 1 mm and 0.5 degrees; the same figures must agree to rounding.
+        # 1 mm and 0.5 degrees would do; the same figures must agree to rounding.
         np.testing.assert_allclose(site.xpos, position, atol=1e-9)
         np.testing.assert_allclose(site.xmat.reshape(3, 3), orientation, atol=1e-9)
 

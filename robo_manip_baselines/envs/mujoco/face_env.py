@@ -20,6 +20,7 @@ from robo_manip_baselines.envs.mujoco.motion import (
 from robo_manip_baselines.envs.mujoco.rendering import CameraRenderer
 from robo_manip_baselines.envs.mujoco.replay import FACE_MOTIONS, FaceReplay
 from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE, build_cell
+from robo_manip_baselines.envs.mujoco.spaces import observation_space
 from robo_manip_baselines.envs.mujoco.vx300s import (
     ARM_JOINTS,
     FINGER_CLOSED,
@@ -40,14 +41,6 @@ PARKED_QPOS = (0.0, -1.8, 1.55, 0.0, -1.2, 0.0)
 
 RENDER_CAMERA = "angle"
 """What ``render()`` shows."""
-
-# Wide enough for whatever physics may do; observations are not clipped to them.
-_BOUNDS = {
-    " position": 2.0 * np.pi,
-    " velocity": 100.0,
-    "t_": 60.0,
-}
-_LENGTH_BOUND = 5.0
 
 
 class FaceEnv(gymnasium.Env[Any, Any]):
@@ -98,7 +91,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         )
         self._index_model()
         self.action_space = self._make_action_space()
-        self.observation_space = self._make_observation_space()
+        self.observation_space = observation_space(spec)
 
     # -- what a task says -----------------------------------------------------------------------
 
@@ -137,16 +130,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     def _make_action_space(self) -> gymnasium.spaces.Box:
         low, high = self.model.actuator_ctrlrange[self._actuators].T
         return gymnasium.spaces.Box(low.astype(np.float32), high.astype(np.float32))
-
-    def _make_observation_space(self) -> gymnasium.spaces.Dict:
-        spaces: dict[str, gymnasium.Space[Any]] = {}
-        for key, names in self.observation_spec.components().items():
-            high = np.array([_bound(name) for name in names], dtype=np.float32)
-            spaces[key] = gymnasium.spaces.Box(-high, high)
-        shape = (*self.observation_spec.image_size, 3)
-        for key in self.observation_spec.image_keys():
-            spaces[key] = gymnasium.spaces.Box(0, 255, shape, np.uint8)
-        return gymnasium.spaces.Dict(spaces)
 
     # -- Gymnasium ------------------------------------------------------------------------------
 
@@ -259,6 +242,11 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         """m between the inner lips."""
         return float(self.replay.jaw[self.replay.control_index(self._motion_step())])
 
+    @property
+    def mouth_opening(self) -> NDArray[np.float64]:
+        """(2,) m: half width and half height of the opening between the inner lips."""
+        return self.replay.opening[self.replay.control_index(self._motion_step())]
+
     def truth(self) -> Truth:
         """What is so now, uncorrupted."""
         data = self.data
@@ -306,9 +294,3 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 def world_of(env: gymnasium.Env[Any, Any]) -> FaceEnv:
     """Return the environment inside Gymnasium's wrappers."""
     return cast(FaceEnv, env.unwrapped)
-
-
-def _bound(name: str) -> float:
-    """Return a generous bound of an observed quantity, in its unit."""
-    matches = [bound for part, bound in _BOUNDS.items() if part in name]
-    return matches[0] if matches else _LENGTH_BOUND

@@ -248,7 +248,7 @@ class FeedingEnv(FaceEnv):
     def _facts(self) -> Facts:
         mouth, gripper, cube = self.mouth_track[0], self.gripper_position, self.object_position()
         axes = self.data.site_xmat[self._mouth_site].reshape(3, 3)
-        half_width, half_height = map(float, self.face.opening(self.jaw_opening))
+        half_width, half_height = self.mouth_opening.tolist()
         return Facts(
             time=self.time,
             is_held=bool(self._fingers_on_cube.all()),

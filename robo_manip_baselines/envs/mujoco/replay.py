@@ -29,13 +29,14 @@ class FaceReplay:
         bodies: for each mocap body, positions (P, 3) m and orientations (P, 4) wxyz, world.
         mouth: (T, K, 3) m, world: the mouth now and at ``FRAMES_AHEAD``.
         jaw: (T,) m between the inner lips.
+        opening: (T, 2) m, half width and half height of the mouth's opening.
         substeps: physics steps in a control step.
-        starts_moving: control step at which the segment starts; None while it waits.
     """
 
     bodies: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     mouth: NDArray[np.float64]
     jaw: NDArray[np.float64]
+    opening: NDArray[np.float64]
     substeps: int
 
     @classmethod
@@ -60,13 +61,14 @@ class FaceReplay:
             substeps: physics steps in a control step.
         """
         physics = np.arange(round(duration / timestep) + 1) * timestep
-        displacement, orientation, jaw = segment.at(physics)
-        control = physics[::substeps]
-        ahead, _, _ = segment.at(control[:, None] + FRAMES_AHEAD)
+        displacement, orientation, recorded_jaw = segment.at(physics)
+        ahead, _, _ = segment.at(physics[::substeps, None] + FRAMES_AHEAD)
+        jaw = recorded_jaw + REST_OPENING
         return cls(
-            bodies=face.body_poses(start_position + displacement, orientation, jaw + REST_OPENING),
+            bodies=face.body_poses(start_position + displacement, orientation, jaw),
             mouth=start_position + ahead,
-            jaw=jaw[::substeps] + REST_OPENING,
+            jaw=jaw[::substeps],
+            opening=np.stack(face.opening(jaw[::substeps]), axis=-1),
             substeps=substeps,
         )
 
@@ -75,5 +77,5 @@ class FaceReplay:
         return min(max(step, 0), (len(self.jaw) - 1) * self.substeps)
 
     def control_index(self, step: int) -> int:
-        """Row of ``mouth`` and ``jaw`` at control step ``step`` of the segment; likewise."""
+        """Row of the other arrays at control step ``step`` of the segment; held likewise."""
         return min(max(step, 0), len(self.jaw) - 1)
