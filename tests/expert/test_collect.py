@@ -18,6 +18,7 @@ import pytest
 
 from robo_manip_baselines.data import EpisodeReader, list_episodes, read_metadata
 from robo_manip_baselines.data.verify import verify_dataset
+from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.evaluation.episode_replay import deviation
 from robo_manip_baselines.expert.collect import Collection, collect
@@ -141,11 +142,48 @@ def test_killed_and_continued_it_ends_with_the_same_files(folder: Path, tmp_path
 def test_bad_requests_get_one_line_and_exit_code_2(
     tmp_path: Path, arguments: list[str], message: str
 ) -> None:
-    command = [sys.executable, str(ROOT / "bin/Rollout.py"), *arguments]
     if "--cameras" not in arguments:
-        command += ["--cameras", "none"]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        arguments = [*arguments, "--cameras", "none"]
+    refused(arguments, message, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        # No device at that number: as where no driver is installed, EGL gives no display.
+        ({"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "99"}, "apt-get install"),
+        ({"MUJOCO_GL": "crayon"}, "MUJOCO_GL=crayon renders nothing; valid: egl, osmesa, glfw"),
+        ({"MUJOCO_GL": "disable"}, "--cameras none"),
+    ],
+)
+def test_without_opengl_cameras_are_refused(
+    tmp_path: Path, environment: dict[str, str], message: str
+) -> None:
+    refused(["FeedingEnv", "--scripted"], message, tmp_path, environment)
+
+
+def test_a_damaged_motion_library_is_refused_by_name(tmp_path: Path) -> None:
+    library = tmp_path / "motion.npz"
+    library.write_bytes(DEFAULT_LIBRARY.read_bytes()[:1000])
+    folder = tmp_path / "here"
+    folder.mkdir()
+    arguments = ["FeedingEnv", "--scripted", "--cameras", "none"]
+    refused([*arguments, "--motion_library", str(library)], "motion.npz' cannot be read", folder)
+
+
+def refused(
+    arguments: list[str], message: str, folder: Path, environment: dict[str, str] | None = None
+) -> None:
+    """Run Rollout.py in a folder and expect one line, exit code 2 and nothing half-written."""
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "bin/Rollout.py"), *arguments],
+        cwd=folder,
+        env={**os.environ, **(environment or {})},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert result.returncode == 2, result.stderr
     assert message in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())  # nothing half-written
+    assert not list(folder.iterdir())
