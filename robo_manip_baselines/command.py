@@ -81,8 +81,8 @@ def run_command(main: Callable[[], int | None]) -> NoReturn:
         if not _is_reader_gone():
             traceback.print_exc()
         code = EXIT_FAILED
-    except Exception:
-        if problem := _backend_problem():
+    except Exception as error:
+        if problem := _backend_problem(error):
             code = _say(f"error: {problem}", EXIT_WRONG_REQUEST)
         else:
             traceback.print_exc()
@@ -212,9 +212,11 @@ def _box_to_line(text: str) -> str:
     return message
 
 
-def _backend_problem() -> str | None:
-    """Say why MuJoCo could not even be imported with the backend that ``$MUJOCO_GL`` names."""
-    if "mujoco" in sys.modules or not os.environ.get("MUJOCO_GL"):
+def _backend_problem(error: Exception) -> str | None:
+    """Say why MuJoCo could not be imported with the backend that ``$MUJOCO_GL`` names, if so."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    modules = {frame.f_globals.get("__name__", "") for frame in frames}
+    if "mujoco" in sys.modules or not any(name.split(".")[0] == "mujoco" for name in modules):
         return None
     problem = opengl_problem()
     return problem and f"{problem} (or unset MUJOCO_GL: --cameras none --preview 0 needs no OpenGL)"
