@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import itertools
 import logging
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
@@ -13,6 +17,9 @@ from face_prediction.errors import RequestError
 from face_prediction.extract_command import ExtractOptions, run_extract
 from face_prediction.motion_command import ExportMotionOptions, run_export_motion
 from face_prediction.surface import ExportSurfaceOptions, export_surface
+
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_FRAME = re.compile(r"^[\s│|╭╰─+-]+|[\s│|╮╯─+-]+$")
 
 logger = logging.getLogger(__name__)
 
@@ -38,20 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     doing: it raises, and Python exits with 1.
     """
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
-    union: Any = None
-    for name, kind, _ in COMMANDS:
-        subcommand = Annotated[kind, tyro.conf.subcommand(name=name)]
-        union = subcommand if union is None else union | subcommand
-    options = tyro.cli(
-        union,
-        prog="face-prediction",
-        description=DESCRIPTION,
-        args=None if arguments is None else list(arguments),
-        use_underscores=True,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
-    run = next(run for _, kind, run in COMMANDS if isinstance(options, kind))
     try:
+        options = _parse(arguments)
+        run = next(run for _, kind, run in COMMANDS if isinstance(options, kind))
         return run(options) or 0
     except RequestError as error:
         logger.error("face-prediction: %s", error)
@@ -59,3 +55,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         logger.error("face-prediction: interrupted; finished files are kept")
         return 130
+
+
+def _parse(arguments: Sequence[str] | None) -> Any:
+    """Read the command line; what is wrong with it becomes one line."""
+    union: Any = None
+    for name, kind, _ in COMMANDS:
+        subcommand = Annotated[kind, tyro.conf.subcommand(name=name)]
+        union = subcommand if union is None else union | subcommand
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return tyro.cli(
+                union,
+                prog="face-prediction",
+                description=DESCRIPTION,
+                args=None if arguments is None else list(arguments),
+                use_underscores=True,
+                config=(tyro.conf.OmitSubcommandPrefixes,),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise RequestError(f"{_first_words(told.getvalue())}; see face-prediction --help") from None
+
+
+def _first_words(box: str) -> str:
+    """What tyro says in its box, up to the first rule or gap, as one line."""
+    lines = [_FRAME.sub("", _COLOUR.sub("", line)) for line in box.splitlines()[1:]]
+    words = itertools.takewhile(bool, lines)
+    return " ".join(words).rstrip(".") or "these options are not valid"

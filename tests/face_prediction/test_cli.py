@@ -35,11 +35,20 @@ def test_help_shows_defaults_and_an_example(capsys, command, words) -> None:
         assert word in shown
 
 
-@pytest.mark.parametrize("arguments", [["nonsense"], ["extract", "--nonsense"], []])
-def test_an_unknown_request_is_2(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit) as exited:
-        main(arguments)
-    assert exited.value.code == 2
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["nonsense"], "nonsense"),
+        (["extract", "--nonsense"], "--nonsense"),
+        (["extract", "--fps", "many", "a.mp4"], "'many'"),
+        ([], "extract, export-motion, export-surface"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_and_2(arguments: list[str], word: str, caplog) -> None:
+    assert main(arguments) == 2
+    (record,) = caplog.records
+    assert word in record.getMessage()
+    assert "\n" not in record.getMessage()
 
 
 def test_a_wrong_request_is_one_line_and_2(tmp_path: Path, repository: Path) -> None:
