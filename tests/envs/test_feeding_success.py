@@ -122,6 +122,7 @@ def test_a_perfect_episode() -> None:
         ((NOTHING,), Phase.REACH),
         ((HELD,), Phase.GRASP),
         ((HELD, NOTHING), Phase.REACH),
+        ((replace(LIFTED, is_held=False),), Phase.REACH),  # tossed up, not lifted
         ((HELD, LIFTED), Phase.CARRY),
         ((HELD, LIFTED, HELD), Phase.CARRY),
         ((HELD, LIFTED, AT_MOUTH), Phase.DELIVER),

@@ -16,7 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robo_manip_baselines.data import EpisodeReader, list_episodes, read_metadata
+from robo_manip_baselines.data import (
+    EpisodeReader,
+    list_episodes,
+    read_metadata,
+    write_episode,
+)
+from robo_manip_baselines.data.schema import ATTRIBUTES
 from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.errors import RequestError
@@ -58,6 +64,18 @@ def test_the_replay_reproduces_every_recorded_state(folder: Path) -> None:
         found = deviation(path)
         assert (found.qpos, found.qvel) == (0.0, 0.0)
         assert found.steps > 100
+
+
+def test_a_replay_that_strays_is_noticed(folder: Path, tmp_path: Path) -> None:
+    with EpisodeReader(list_episodes(folder)[0]) as episode:
+        arrays, known = episode.arrays, episode.attributes
+    derived = {item.name for item in ATTRIBUTES if item.derived}
+    arrays["action"][50, 0] += 0.01  # rad
+    path = tmp_path / "episode_000000.hdf5"
+    write_episode(path, arrays, {}, {k: v for k, v in known.items() if k not in derived})
+    found = deviation(path)
+    assert found.qpos > 1e-4
+    assert found.qvel > 1e-4
 
 
 def test_the_files_are_whole_and_say_what_happened(folder: Path) -> None:
