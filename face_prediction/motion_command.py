@@ -58,23 +58,23 @@ class ExportMotionOptions:
     report: Path | None = None
     #: Seconds of an episode: runs are at least this long, and from every start that leaves this
     #: much, the mouth stays within reach.
-    min_run: float = 12.0
+    min_run: float = MotionSettings.min_run
     #: Reach in metres on each axis from where a window starts.
-    max_displacement: float = 0.08
+    max_displacement: float = MotionSettings.max_displacement
     #: Degrees between the head and facing the camera.
-    max_rotation: float = 35.0
+    max_rotation: float = QualityLimits.max_rotation
     #: m/s across the view; a faster mouth is a jump of the detector.
-    max_speed: float = 0.6
+    max_speed: float = QualityLimits.max_speed
     #: m/s^2 across the view; more is a spike.
-    max_acceleration: float = 15.0
+    max_acceleration: float = QualityLimits.max_acceleration
     #: degrees/s; a faster head is a jump.
-    max_turn_rate: float = 400.0
+    max_turn_rate: float = QualityLimits.max_turn_rate
     #: m/s between the lips; more is a jump.
-    max_jaw_speed: float = 0.6
+    max_jaw_speed: float = QualityLimits.max_jaw_speed
     #: Hz of the low-pass on the depth of clips that need it; None: replay every depth as measured.
-    depth_cutoff: float | None = 3.0
+    depth_cutoff: float | None = MotionSettings.depth_cutoff
     #: Metres: clips whose depth trembles more than this from frame to frame get the low-pass.
-    max_depth_tremor: float = 0.001
+    max_depth_tremor: float = MotionSettings.max_depth_tremor
 
 
 def run_export_motion(options: ExportMotionOptions) -> int:

@@ -23,6 +23,7 @@ from robo_manip_baselines.expert.phases import (
     View,
     level_at,
 )
+from robo_manip_baselines.observation import FRAME_PERIOD
 
 GRASP_OFFSET = 0.03
 """m from the gripper site to the cube's centre, along the fingers. The fingers hold the rear of the
@@ -58,7 +59,7 @@ class FeedingExpertConfig:
 
 EXPERTS: dict[str, FeedingExpertConfig] = {
     "reactive": FeedingExpertConfig(),
-    "anticipatory": FeedingExpertConfig(lead=4 / 30),
+    "anticipatory": FeedingExpertConfig(lead=4 * FRAME_PERIOD),
 }
 """``reactive`` is Algorithm 1 as published; ``anticipatory`` knows the recorded future."""
 

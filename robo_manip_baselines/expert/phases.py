@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.face_env import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.scene import ARM_BASES
+from robo_manip_baselines.observation import FRAME_PERIOD
 
 RIGHT_BASE = np.array(ARM_BASES["right"][0])
 """m, world: the base of the arm that feeds."""
@@ -72,7 +73,7 @@ class View:
 
     def mouth(self, lead: float = 0.0) -> NDArray[np.float64]:
         """Return the mouth ``lead`` s ahead, interpolated; (3,) m. At most 5 frames ahead."""
-        ahead = np.arange(len(self.mouth_track)) / 30.0
+        ahead = np.arange(len(self.mouth_track)) * FRAME_PERIOD
         return np.array([np.interp(lead, ahead, axis) for axis in self.mouth_track.T])
 
 

@@ -1,7 +1,16 @@
 """What a policy is shown: which components, in which order, and how they are built from truth."""
 
 from robo_manip_baselines.observation.error import ERRORS
-from robo_manip_baselines.observation.spec import CAMERAS, PRESETS, ObservationSpec
+from robo_manip_baselines.observation.spec import CAMERAS, MAX_HORIZON, PRESETS, ObservationSpec
 from robo_manip_baselines.observation.truth import FRAME_PERIOD, Truth, observe
 
-__all__ = ["CAMERAS", "ERRORS", "FRAME_PERIOD", "PRESETS", "ObservationSpec", "Truth", "observe"]
+__all__ = [
+    "CAMERAS",
+    "ERRORS",
+    "FRAME_PERIOD",
+    "MAX_HORIZON",
+    "PRESETS",
+    "ObservationSpec",
+    "Truth",
+    "observe",
+]

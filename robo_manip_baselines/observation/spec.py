@@ -1,4 +1,4 @@
-"""What a policy is shown, as one frozen dataclass that travels with environments and checkpoints.
+"""What a policy is shown, as one frozen dataclass.
 
 Legend: A arms (1 or 2), H horizon in frames of 1/30 s, C cameras.
 """
@@ -6,8 +6,7 @@ Legend: A arms (1 or 2), H horizon in frames of 1/30 s, C cameras.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from robo_manip_baselines.envs.mujoco.vx300s import ARM_JOINTS
 from robo_manip_baselines.errors import RequestError, require_choice
@@ -98,21 +97,6 @@ class ObservationSpec:
     def image_keys(self) -> dict[str, str]:
         """Map keys of the observation to cameras."""
         return {f"images/{camera}": camera for camera in self.cameras}
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON types."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> ObservationSpec:
-        """Undo ``to_json``."""
-        return cls(
-            **{
-                **values,
-                "cameras": tuple(values["cameras"]),
-                "image_size": tuple(values["image_size"]),
-            }
-        )
 
 
 def _state_names(arms: Sequence[str]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -99,11 +98,6 @@ def test_sizes_of_the_papers_presets() -> None:
     assert sizes["current_pred", 1] == {"state": 14, "prediction": 10}
     assert sizes["current_pred", 2] == {"state": 14, "prediction": 15}
     assert sizes["current_pred", 5] == {"state": 14, "prediction": 30}
-
-
-@given(specs)
-def test_json_round_trip(spec: ObservationSpec) -> None:
-    assert ObservationSpec.from_json(json.loads(json.dumps(spec.to_json()))) == spec
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from robo_manip_baselines.errors import RequestError, require_choice
+from robo_manip_baselines.observation import MAX_HORIZON
 
 SCHEMA = "recorded_face_motion"
 VERSION = 1
@@ -26,9 +27,6 @@ DEFAULT_LIBRARY = Path(str(files("robo_manip_baselines.envs.mujoco") / "assets/f
 
 SEGMENT_DURATION = 12.0
 """Seconds of recorded motion replayed in an episode (paper, section IV.C)."""
-
-HORIZONS = 5
-"""Longest prediction horizon, in frames of the recording (paper, section IV.C)."""
 
 WORLD_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """World axes (x right, y forward, z up) from the recording camera's (x right, y up, z towards
@@ -203,7 +201,7 @@ class MotionLibrary:
         """
         begin = int(self.run_start[run]) + start
         run_end = int(self.run_start[run] + self.run_length[run])
-        end = min(begin + math.ceil(duration * self.fps) + 1 + HORIZONS, run_end)
+        end = min(begin + math.ceil(duration * self.fps) + 1 + MAX_HORIZON, run_end)
         moved = self.mouth[begin:end] - self.mouth[begin]
         return MotionSegment(
             fps=self.fps,

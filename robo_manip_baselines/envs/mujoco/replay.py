@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel
-from robo_manip_baselines.envs.mujoco.motion import HORIZONS, MotionSegment
+from robo_manip_baselines.envs.mujoco.motion import MotionSegment
+from robo_manip_baselines.observation import FRAME_PERIOD, MAX_HORIZON
 
 FACE_MOTIONS = ("episode", "after_lift")
 """When the recorded motion starts: with the episode (paper, section IV.C), or when the cube has
 been lifted (paper, Algorithm 1, line 12)."""
 
-FRAMES_AHEAD = np.arange(HORIZONS + 1) / 30.0
+FRAMES_AHEAD = np.arange(MAX_HORIZON + 1) * FRAME_PERIOD
 """s ahead at which the true mouth is told: now and at 1 ... 5 frames of 1/30 s."""
 
 
