@@ -1,4 +1,4 @@
-"""Let an expert act in an environment and record its episodes."""
+"""Let an expert act and record demonstrations, or a trained policy and see how well it does."""
 
 from robo_manip_baselines.command import parse, run_command
 

@@ -101,6 +101,7 @@ def parse(
     *,
     description: str | None = None,
     args: Sequence[str] | None = None,
+    default: Options | None = None,
 ) -> Options: ...
 
 
@@ -111,6 +112,7 @@ def parse(
     *,
     description: str | None = None,
     args: Sequence[str] | None = None,
+    default: Any = None,
 ) -> Any: ...
 
 
@@ -120,6 +122,7 @@ def parse(
     *,
     description: str | None = None,
     args: Sequence[str] | None = None,
+    default: Any = None,
 ) -> Any:
     """Read the command line into ``options_type``.
 
@@ -132,6 +135,7 @@ def parse(
         example: a command line that works, shown at the end of the description.
         description: first words of the help; by default the docstring of ``options_type``.
         args: instead of ``sys.argv[1:]``.
+        default: an instance whose values are the defaults, instead of those of ``options_type``.
 
     Raises:
         RequestError: one line that names what was wrong and what is valid.
@@ -140,13 +144,15 @@ def parse(
     given = list(sys.argv[1:] if args is None else args)
     text = description or inspect.getdoc(options_type) or ""
     text = f"{text.strip()}\n\nExample: {example}"
-    result, unknown = _call_tyro(options_type, text, given)
+    result, unknown = _call_tyro(options_type, text, given, default)
     if unknown:
-        raise RequestError(_unknown_message(unknown, options_type, text, given))
+        raise RequestError(_unknown_message(unknown, options_type, text, given, default))
     return result
 
 
-def _call_tyro(options_type: Any, description: str, args: Sequence[str]) -> tuple[Any, list[str]]:
+def _call_tyro(
+    options_type: Any, description: str, args: Sequence[str], default: Any
+) -> tuple[Any, list[str]]:
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
@@ -156,6 +162,7 @@ def _call_tyro(options_type: Any, description: str, args: Sequence[str]) -> tupl
                     options_type,
                     description=description,
                     args=args,
+                    **({} if default is None else {"default": default}),
                     use_underscores=True,
                     return_unknown_args=True,
                     config=(tyro.conf.OmitSubcommandPrefixes,),
@@ -177,9 +184,15 @@ def _call_tyro(options_type: Any, description: str, args: Sequence[str]) -> tupl
 
 
 def _unknown_message(
-    unknown: Sequence[str], options_type: Any, description: str, args: Sequence[str]
+    unknown: Sequence[str],
+    options_type: Any,
+    description: str,
+    args: Sequence[str],
+    default: Any,
 ) -> str:
-    known = _known_options(options_type, description, [a for a in args if a not in unknown])
+    known = _known_options(
+        options_type, description, [a for a in args if a not in unknown], default
+    )
     name = next((arg for arg in unknown if arg.startswith("-")), unknown[0])
     if not name.startswith("-"):
         return f"'{name}' is one argument too many; {_help_hint()}"
@@ -189,11 +202,13 @@ def _unknown_message(
     return f"unknown option '{name}'{hint}; valid: {', '.join(known)}; {_help_hint()}"
 
 
-def _known_options(options_type: Any, description: str, args: Sequence[str]) -> list[str]:
+def _known_options(
+    options_type: Any, description: str, args: Sequence[str], default: Any
+) -> list[str]:
     """The options that ``--help`` lists after ``args``, which may hold a subcommand."""
     page = io.StringIO()
     with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit, RequestError):
-        _call_tyro(options_type, description.split("\n\nExample:")[0], [*args, "--help"])
+        _call_tyro(options_type, description.split("\n\nExample:")[0], [*args, "--help"], default)
     names = _OPTION.findall(_ANSI.sub("", page.getvalue()))
     return list(dict.fromkeys(name for name in names if name != "--help"))
 

@@ -38,9 +38,11 @@ LIFT = 0.12
 STANDOFF = np.array([0.20, 0.0, 0.0])
 """m from where the mouth is to where the approach starts, level and straight in front of it."""
 
-INSERTION = np.array([0.033, 0.0, 0.0])
-"""m from the mouth to the gripper when it lets go: the cube's centre is then between the lips,
-3 mm before the mouth's centre, and the finger tips are 15 mm before it, clear of the lips."""
+INSERTION = np.array([0.028, 0.0, 0.0])
+"""m from the mouth to the gripper when it lets go: inside the 0.03 m of Algorithm 1, so that whoever
+learns from it is shown a place where the condition holds, not its edge. The cube's centre is then
+between the lips, 2 mm behind the mouth's centre, and the finger tips are 10 mm before it, at the
+front of the lips."""
 
 WITHDRAWAL = np.array([0.14, 0.0, 0.0])
 """m from the mouth to the gripper before it turns home."""

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robo_manip_baselines.data import EpisodeReader, episode_path
+from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
+from robo_manip_baselines.data.example import make_arrays, make_attributes
 from robo_manip_baselines.evaluation.episode_replay import remake_env
 from robo_manip_baselines.expert.collect import Collection, collect
-from robo_manip_baselines.observation import ObservationSpec, Truth, observe
-
-pytestmark = pytest.mark.long
+from robo_manip_baselines.observation import ObservationSpec, observe
+from robo_manip_baselines.observation.recorded import recorded_truth
 
 
 @pytest.fixture(scope="module")
@@ -23,20 +23,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return episode_path(folder, 4, success=True)
 
 
-def truth_of(episode: EpisodeReader) -> Truth:
-    """(T, ...) truth of a recorded episode of one arm."""
-    return Truth(
-        time=episode.array("time"),
-        joint_position=episode.array("joint_position")[:, None],
-        joint_velocity=episode.array("joint_velocity")[:, None],
-        gripper_position=episode.array("gripper_position"),
-        gripper_velocity=episode.array("gripper_velocity"),
-        end_effector_position=episode.array("end_effector_position"),
-        mouth_position=episode.array("mouth_position"),
-        object_position=episode.array("object_pose")[:, :3],
-    )
-
-
+@pytest.mark.long
 @pytest.mark.parametrize(
     "spec",
     [
@@ -55,10 +42,30 @@ def test_a_file_read_with_a_preset_is_what_the_environment_shows(
             remake_env(episode, obs=spec.obs, horizon=spec.horizon, object_pose=spec.object_pose)
         ) as env,
     ):
-        read = observe(spec, truth_of(episode))
+        read = observe(spec, recorded_truth(episode))
         shown, _ = env.reset(seed=episode.attributes["seed"])
         for step, action in enumerate(episode.array("action")):
             for key, value in shown.items():
                 # Sums of squares may be added up in another order for a batch: one float32 ulp.
                 np.testing.assert_allclose(read[key][step], value, rtol=3e-7, err_msg=key)
             shown, *_ = env.step(action)
+
+
+def test_two_arms_are_told_apart(tmp_path: Path) -> None:
+    arrays = make_arrays(steps=5, arms=2)
+    path = write_episode(tmp_path / "a.hdf5", arrays, {}, make_attributes(arms=2))
+    spec = ObservationSpec(arms="both", cameras=())
+    with EpisodeReader(path) as episode:
+        truth = recorded_truth(episode)
+    assert truth.joint_position.shape == truth.joint_velocity.shape == (5, 2, 6)
+    assert truth.gripper_position.shape == (5, 2)
+    names = spec.components()["state"]
+    state = dict(zip(names, observe(spec, truth)["state"].T, strict=True))
+    for arm, first in (("left", 0), ("right", 6)):
+        for field in ("position", "velocity"):
+            waist = arrays[f"joint_{field}"][:, first].astype(np.float32)
+            wrist = arrays[f"joint_{field}"][:, first + 5].astype(np.float32)
+            gripper = arrays[f"gripper_{field}"][:, first // 6].astype(np.float32)
+            np.testing.assert_array_equal(state[f"{arm}/waist {field}"], waist)
+            np.testing.assert_array_equal(state[f"{arm}/wrist_rotate {field}"], wrist)
+            np.testing.assert_array_equal(state[f"{arm}/gripper {field}"], gripper)

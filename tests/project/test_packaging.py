@@ -83,6 +83,8 @@ def test_what_the_dependencies_need_is_pinned(
             continue  # an extra that is not installed here
         for line in lines:
             needed = Requirement(line)
+            if re.match(r"nvidia-|cuda-|triton", needed.name):
+                continue  # torch's own, which it pins exactly, and only its CUDA builds need
             environments = [{"extra": extra} for extra in extras] or [{"extra": ""}]
             if needed.marker is None or any(map(needed.marker.evaluate, environments)):
                 todo.append((needed.name, frozenset(needed.extras)))

@@ -1,0 +1,321 @@
+"""Time of a training step and of a prediction of ACT, beside the public code's way of computing.
+
+Both networks have the same layers and sizes (the paper's Table III unless options say otherwise)
+and random weights; how the other one computes is in `act_public.py`.
+Prints Markdown tables. Run: ``python benchmarks/act_step.py``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import Any, cast
+
+import torch
+from act_public import PublicWay
+from torch import Tensor
+
+from robo_manip_baselines.command import parse, run_command
+from robo_manip_baselines.errors import RequestError, require_choice
+from robo_manip_baselines.policy.act.config import ActConfig
+from robo_manip_baselines.policy.act.model import ActModel
+from robo_manip_baselines.policy.interface import Batch, PolicyModel, Sizes
+
+PHASES = ("transfer", "forward", "backward", "optimiser")
+WARM_UP = 2
+LEARNING_RATE = 1e-5
+
+
+@dataclass(frozen=True)
+class Options:
+    """Time ACT: phases of a training step, and predictions."""
+
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    precision: str = "bf16"
+    """bf16 (autocast) or fp32, of our network; the other one is fp32."""
+    compile: bool = False
+    """Whether our network goes through torch.compile."""
+    cuda_graph: bool = False
+    """Whether our step and our prediction are recorded once and replayed; CUDA only."""
+    batch_size: int = 8
+    """Examples in a training step."""
+    steps: int = 5
+    """Training steps of each, in turn, after two to warm up."""
+    predictions: int = 30
+    """Predictions of one example by each."""
+    num_cameras: int = 3
+    """Cameras; 0 for none."""
+    image_size: tuple[int, int] = (480, 640)
+    """Height and width."""
+    state_size: int = 14
+    """Numbers of the state."""
+    action_size: int = 7
+    """Numbers of an action."""
+    threads: int = 2
+    """Threads of the processor."""
+    processor_time: bool = False
+    """Count the seconds that processors work, not those that pass: for a machine that others use
+    too. With --threads 1; CPU only."""
+    public: bool = True
+    """Whether to time the public code's way too."""
+
+    def __post_init__(self) -> None:
+        require_choice("device", self.device, ("auto", "cpu", "cuda"))
+        require_choice("precision", self.precision, ("bf16", "fp32"))
+        if self.cuda_graph and self.where.type != "cuda":
+            raise RequestError("cuda_graph: needs a CUDA device; leave it out")
+
+        if self.processor_time and self.where.type != "cpu":
+            raise RequestError("processor_time: says nothing about a GPU; leave it out")
+
+    @property
+    def clock(self) -> Callable[[], float]:
+        """What tells the time, in seconds."""
+        return time.process_time if self.processor_time else time.perf_counter
+
+    @property
+    def where(self) -> torch.device:
+        """The device that ``device`` names."""
+        found = "cuda" if torch.cuda.is_available() else "cpu"
+        return torch.device(found if self.device == "auto" else self.device)
+
+
+def make_batch(options: Options, size: int, as_float: bool) -> Batch:
+    """A batch in main memory; images as each of the two networks wants them."""
+    generator = torch.Generator().manual_seed(0)
+    chunk = ActConfig().chunk_size
+    is_pad = torch.arange(chunk)[None] >= torch.linspace(chunk // 5, chunk, size).long()[:, None]
+    shape = (size, options.num_cameras, *options.image_size, 3)
+    images = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
+    if as_float:
+        images = images.permute(0, 1, 4, 2, 3).float().div_(255.0).contiguous()
+    batch = Batch(
+        state=torch.randn(size, options.state_size, generator=generator),
+        images=images if options.num_cameras else None,
+        action=torch.randn(size, chunk, options.action_size, generator=generator),
+        is_pad=is_pad,
+        noise=torch.randn(size, ActConfig().latent_size, generator=generator),
+        num_valid=(~is_pad).sum().float(),
+        num_examples=torch.tensor(float(size)),
+    )
+    if options.where.type == "cuda":
+        batch = _map(batch, lambda value: value.pin_memory())
+    return batch
+
+
+def _map(batch: Batch, change: Callable[[Tensor], Tensor]) -> Batch:
+    """A batch with every tensor changed."""
+    values = {field.name: getattr(batch, field.name) for field in fields(batch)}
+    return replace(batch, **{k: None if v is None else change(v) for k, v in values.items()})
+
+
+def _copy(source: Batch, target: Batch) -> None:
+    """Overwrite the tensors of ``target``."""
+    for field in fields(Batch):
+        value = getattr(source, field.name)
+        if value is not None:
+            getattr(target, field.name).copy_(value, non_blocking=True)
+
+
+def _wait(device: torch.device) -> None:
+    """Let the device finish what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+
+
+def record(compute: Callable[[], Any]) -> tuple[torch.cuda.CUDAGraph, Any]:
+    """Record what ``compute`` gives the GPU to do; returns the graph and what it returned."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(WARM_UP):
+            compute()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = compute()
+    return graph, result
+
+
+class Trainer:
+    """Runs steps of one network and takes the time of each phase."""
+
+    def __init__(self, model: PolicyModel, batch: Batch, options: Options, ours: bool) -> None:
+        self.device = options.where
+        self.clock = options.clock
+        self.model = model.to(self.device).train()
+        self.host_batch = batch
+        self.batch = _map(batch, lambda value: value.to(self.device))
+        self.bf16 = ours and options.precision == "bf16"
+        self.optimizer = torch.optim.AdamW(
+            cast("Any", model.parameter_groups(LEARNING_RATE)),
+            weight_decay=1e-4,
+            fused=True if ours else None,
+            capturable=ours and options.cuda_graph,
+        )
+        self.loss = torch.compile(model.loss) if ours and options.compile else model.loss
+        self.graph = record(self.compute)[0] if ours and options.cuda_graph else None
+
+    def autocast(self) -> contextlib.AbstractContextManager[Any]:
+        """The context of the forward pass."""
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
+
+    def compute(self, mark: Callable[[], None] = lambda: None) -> None:
+        """One step on ``self.batch``."""
+        self.optimizer.zero_grad(set_to_none=True)
+        with self.autocast():
+            loss = self.loss(self.batch)["loss"]
+        mark()
+        loss.backward()
+        mark()
+        self.optimizer.step()
+        mark()
+
+    def load(self) -> None:
+        """Bring the batch from main memory; a recorded step reads it where it has always been."""
+        if self.graph is None:
+            self.batch = _map(self.host_batch, lambda v: v.to(self.device, non_blocking=True))
+        else:
+            _copy(self.host_batch, self.batch)
+
+    def step(self) -> list[float]:
+        """Seconds of each phase; a recorded step is all in its forward phase."""
+        marks: list[float] = []
+
+        def mark() -> None:
+            _wait(self.device)
+            marks.append(self.clock())
+
+        mark()
+        self.load()
+        mark()
+        if self.graph is None:
+            self.compute(mark)
+        else:
+            self.graph.replay()
+            mark()
+            marks += [marks[-1]] * 2
+        return [after - before for before, after in pairwise(marks)]
+
+    def run(self, steps: int) -> float:
+        """Seconds a step when nothing waits between the phases."""
+        _wait(self.device)
+        start = self.clock()
+        for _ in range(steps):
+            self.load()
+            self.compute() if self.graph is None else self.graph.replay()
+        _wait(self.device)
+        return (self.clock() - start) / steps
+
+
+def predictor(model: PolicyModel, options: Options, ours: bool) -> Callable[[], Tensor]:
+    """A prediction for one example, from images in main memory to actions in main memory."""
+    device = options.where
+    batch = make_batch(options, 1, as_float=not ours)
+    model = model.to(device).eval()
+    if ours and isinstance(model, ActModel):
+        model = model.for_inference(
+            torch.bfloat16 if options.precision == "bf16" else torch.float32
+        )
+    predict = torch.compile(model.predict) if ours and options.compile else model.predict
+    on_device = _map(batch, lambda value: value.to(device))
+
+    @torch.inference_mode()
+    def eager() -> Tensor:
+        images = None if batch.images is None else batch.images.to(device, non_blocking=True)
+        return predict(batch.state.to(device, non_blocking=True), images).cpu()
+
+    if not (ours and options.cuda_graph):
+        return eager
+    graph, result = record(lambda: predict(on_device.state, on_device.images))
+
+    @torch.inference_mode()
+    def replayed() -> Tensor:
+        _copy(batch, on_device)
+        graph.replay()
+        return result.cpu()
+
+    return replayed
+
+
+def time_predictions(predict: Callable[[], Tensor], number: int, clock: Callable[[], float]) -> str:
+    """Mean, median and 95th percentile in milliseconds, as cells of a table."""
+    for _ in range(WARM_UP):
+        predict()
+    times = []
+    for _ in range(number):
+        start = clock()
+        predict()
+        times.append(1e3 * (clock() - start))
+    last = statistics.quantiles(times, n=20, method="inclusive")[-1] if len(times) > 1 else times[0]
+    return f"{statistics.fmean(times):.1f} | {statistics.median(times):.1f} | {last:.1f}"
+
+
+def main() -> None:
+    """Print both tables."""
+    options = parse(Options, example="python benchmarks/act_step.py --steps 3")
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+    device = options.where
+    name = torch.cuda.get_device_name() if device.type == "cuda" else f"{options.threads} threads"
+    height, width = options.image_size
+    print(
+        f"{device.type} ({name}), torch {torch.__version__}, batch {options.batch_size}, "
+        f"{options.num_cameras} cameras of {height}x{width}, ours {options.precision}"
+        f"{', compiled' * options.compile}{', CUDA graph' * options.cuda_graph}"
+        f"{', processor time' * options.processor_time}"
+    )
+    sizes = Sizes(options.state_size, options.action_size, options.num_cameras, options.image_size)
+    models: dict[str, PolicyModel] = {"ours": ActModel(ActConfig(), sizes)}
+    if options.public:
+        models["public way"] = PublicWay(ActConfig(paper_compat=True), sizes)
+    if options.steps:
+        print_steps(
+            {
+                key: Trainer(
+                    model,
+                    make_batch(options, options.batch_size, as_float=key != "ours"),
+                    options,
+                    ours=key == "ours",
+                )
+                for key, model in models.items()
+            },
+            options.steps,
+        )
+    if options.predictions:
+        print("\n| one prediction | mean, ms | median, ms | 95 %, ms |\n|---|---|---|---|")
+        for key, model in models.items():
+            cells = time_predictions(
+                predictor(model, options, ours=key == "ours"), options.predictions, options.clock
+            )
+            print(f"| {key} | {cells} |", flush=True)
+
+
+def print_steps(trainers: dict[str, Trainer], steps: int) -> None:
+    """Steps of each network in turn, so that whatever else the machine does is shared."""
+    for trainer in trainers.values():
+        for _ in range(WARM_UP):
+            trainer.step()
+    phases: dict[str, list[list[float]]] = {key: [] for key in trainers}
+    for _ in range(steps):
+        for key, trainer in trainers.items():
+            phases[key].append(trainer.step())
+    print(f"\n| training step, ms | {' | '.join(PHASES)} | sum | without waiting |")
+    print("|---|" + "---|" * (len(PHASES) + 2))
+    sums: dict[str, float] = {}
+    for key, rows in phases.items():
+        medians = [statistics.median(column) for column in zip(*rows, strict=True)]
+        sums[key] = sum(medians)
+        cells = [*medians, sums[key], trainers[key].run(steps)]
+        print(f"| {key} | {' | '.join(f'{1e3 * cell:.1f}' for cell in cells)} |", flush=True)
+    if len(sums) == 2:
+        print(f"\nours is {sums['public way'] / sums['ours']:.1f} times as fast")
+
+
+if __name__ == "__main__":
+    run_command(main)

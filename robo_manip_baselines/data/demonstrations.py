@@ -1,0 +1,224 @@
+"""A folder of episodes as one policy sees them: what is observed, and what was done.
+
+Legend: E episodes, T steps of an episode, S elements of all observed vectors together, A elements
+of an action.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robo_manip_baselines.data.episode import EpisodeReader, read_metadata
+from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_episodes, seed_of
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.observation import ObservationSpec, observe
+from robo_manip_baselines.observation.recorded import recorded_truth
+from robo_manip_baselines.observation.vector import to_vector
+
+SHARED = (
+    "env_id",
+    "xml_hash",
+    "control_period",
+    "prediction_period",
+    "action_names",
+    "joint_names",
+)
+"""Attributes that episodes must share for one policy to learn from them."""
+
+_SHOWN = {field.name for field in fields(ObservationSpec)}
+"""Arguments of an environment that say what it shows; files hold truth, whatever was shown."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Episodes one after another, in the order of their seeds.
+
+    Attributes:
+        paths: E files.
+        seeds: E seeds that the episodes were recorded with, ascending.
+        lengths: (E,) int64, steps of each episode.
+        offsets: (E + 1,) int64, row at which each episode begins, and the number of rows.
+        state: (sum T, S) float32, all observed vectors joined, in their own units.
+        action: (sum T, A) float32, in its own units (rad, m).
+        spec: what is observed.
+        env_id: registered id of the environment.
+        action_names: A names.
+        control_period: s between rows.
+        xml_hash: of the simulator's model.
+        env_kwargs: what the environment was made with, but for what ``spec`` says.
+        content_hash: SHA-256 over the content hashes of the files, in order.
+    """
+
+    paths: tuple[Path, ...]
+    seeds: tuple[int, ...]
+    lengths: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    state: NDArray[np.float32]
+    action: NDArray[np.float32]
+    spec: ObservationSpec
+    env_id: str
+    action_names: tuple[str, ...]
+    control_period: float
+    xml_hash: str
+    env_kwargs: Mapping[str, Any]
+    content_hash: str
+
+    def rows(self, episodes: Sequence[int]) -> NDArray[np.int64]:
+        """Return the rows of the episodes of these indices, in their order."""
+        ranges = [np.arange(self.offsets[i], self.offsets[i + 1]) for i in episodes]
+        return np.concatenate([np.zeros(0, np.int64), *ranges])
+
+    def indices(self, seeds: Sequence[int]) -> tuple[int, ...]:
+        """Return the indices of the episodes of these seeds, in their order.
+
+        Raises:
+            RequestError: there is no episode of such a seed.
+        """
+        place = {seed: index for index, seed in enumerate(self.seeds)}
+        missing = [seed for seed in seeds if seed not in place]
+        if missing:
+            raise RequestError(
+                f"'{self.paths[0].parent}' has no episode of seed {missing[0]}; it holds "
+                f"{len(self.seeds)}, seeds {self.seeds[0]} to {self.seeds[-1]}"
+            )
+        return tuple(place[seed] for seed in seeds)
+
+
+def load_demonstrations(
+    folder: Path, spec: ObservationSpec, *, limit: int | None = None
+) -> Demonstrations:
+    """Read the vectors and actions of a folder's episodes; images stay in the files.
+
+    Args:
+        folder: as ``bin/Rollout.py`` writes it; ``failed/`` is left out.
+        spec: what to observe. An ``image_size`` smaller than the recorded one is met by shrinking
+            images as they are read; a larger one is refused, for it would add nothing.
+        limit: read only so many episodes, those of the lowest seeds; all of them if None.
+
+    Raises:
+        RequestError: no such folder, no or not enough episodes in it, episodes that do not belong
+            together, or something in ``spec`` that they do not hold. Says what to do.
+        EpisodeFileError: a file is damaged.
+    """
+    folder = Path(folder)
+    paths = _episode_paths(folder, spec, limit)
+    states: list[NDArray[np.float32]] = []
+    actions: list[NDArray[np.float32]] = []
+    attributes: list[dict[str, Any]] = []
+    for path in paths:
+        with EpisodeReader(path) as episode:
+            attributes.append(episode.attributes)
+            _require_same(paths[0], attributes[0], path, attributes[-1])
+            _require_spec(path, attributes[-1], spec)
+            states.append(to_vector(spec, observe(spec, recorded_truth(episode))))
+            actions.append(episode.array("action").astype(np.float32))
+    lengths = np.array([len(action) for action in actions], dtype=np.int64)
+    hashes = "\n".join(item["content_sha256"] for item in attributes)
+    first = attributes[0]
+    return Demonstrations(
+        paths=tuple(paths),
+        seeds=tuple(item["seed"] for item in attributes),
+        lengths=lengths,
+        offsets=np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)]),
+        state=np.concatenate(states),
+        action=np.concatenate(actions),
+        spec=spec,
+        env_id=first["env_id"],
+        action_names=tuple(first["action_names"]),
+        control_period=first["control_period"],
+        xml_hash=first["xml_hash"],
+        env_kwargs=_world(first),
+        content_hash=hashlib.sha256(hashes.encode()).hexdigest(),
+    )
+
+
+def recording_command(folder: Path, spec: ObservationSpec, num_episodes: int = 50) -> str:
+    """Return the line that records demonstrations of the feeding task for ``spec``."""
+    out = shlex.quote(str(folder))
+    line = f"python bin/Rollout.py FeedingEnv --scripted --num_episodes {num_episodes} --out {out}"
+    if not spec.cameras:
+        return f"{line} --cameras none"
+    height, width = spec.image_size
+    return line if (height, width) == (480, 640) else f"{line} --image_size {height}x{width}"
+
+
+def _episode_paths(folder: Path, spec: ObservationSpec, limit: int | None) -> list[Path]:
+    if limit is not None and limit < 1:
+        raise RequestError(f"{limit} episodes: must be 1 or more")
+    paths = list_episodes(folder) if folder.is_dir() else []
+    if not paths:
+        what = "holds no episode_*.hdf5 file" if folder.is_dir() else "is no folder"
+        raise RequestError(f"'{folder}' {what}; record it: {recording_command(folder, spec)}")
+    if limit is not None and limit > len(paths):
+        recorded = read_metadata(paths[0])
+        same = replace(
+            spec,
+            cameras=tuple(recorded["cameras"]),
+            image_size=tuple(recorded["image_size"]) if recorded["cameras"] else spec.image_size,
+        )
+        # Failures count among the seeds that are done, so that more of them are needed.
+        seeds = max(finished_seeds(folder)) + 1 + limit - len(paths)
+        line = recording_command(folder, same, seeds)
+        raise RequestError(
+            f"'{folder}' holds {len(paths)} episodes, not {limit}; ask for fewer, or record: {line}"
+        )
+    return paths[:limit]
+
+
+def _require_same(
+    first: Path, expected: Mapping[str, Any], path: Path, given: Mapping[str, Any]
+) -> None:
+    """Raise RequestError if two files are not of one kind."""
+    ours = {**{name: expected[name] for name in SHARED}, "env_kwargs": _world(expected)}
+    theirs = {**{name: given[name] for name in SHARED}, "env_kwargs": _world(given)}
+    for name, value in ours.items():
+        if theirs[name] != value:
+            raise RequestError(
+                f"'{path}' has {name} {json.dumps(theirs[name])} where '{first}' has "
+                f"{json.dumps(value)}; keep episodes of one kind in one folder"
+            )
+
+
+def _require_spec(path: Path, attributes: Mapping[str, Any], spec: ObservationSpec) -> None:
+    """Raise RequestError if a file is no demonstration of what is to be observed."""
+    if attributes["seed"] != seed_of(path):
+        raise RequestError(f"'{path}' holds seed {attributes['seed']}: give it its name back")
+    if not attributes["is_success"]:
+        raise RequestError(f"'{path}' is a failure: move it to '{path.parent / FAILED_FOLDER}'")
+    arms = tuple(dict.fromkeys(name.partition("/")[0] for name in attributes["joint_names"]))
+    if arms != spec.arm_names:
+        raise RequestError(
+            f"'{path}' was recorded with the arms {', '.join(arms)}; arms '{spec.arms}' needs "
+            f"{', '.join(spec.arm_names)}"
+        )
+    recorded = attributes["cameras"]
+    there = ", ".join(recorded) or "none"
+    # Beside, for episodes with other images do not belong into the same folder.
+    line = recording_command(path.parent.with_name(f"{path.parent.name}_images"), spec)
+    missing = [camera for camera in spec.cameras if camera not in recorded]
+    if missing:
+        raise RequestError(
+            f"'{path}' has no images of {', '.join(missing)}; its cameras: {there}; choose "
+            f"--cameras {' '.join(recorded) or 'none'}, or record others: {line}"
+        )
+    height, width = attributes["image_size"]
+    if spec.cameras and (spec.image_size[0] > height or spec.image_size[1] > width):
+        raise RequestError(
+            f"image size {spec.image_size[0]}x{spec.image_size[1]}: '{path}' holds "
+            f"{height}x{width}; choose --image_size {height}x{width} or less, or record: {line}"
+        )
+
+
+def _world(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of the environment that say more than what it shows."""
+    kwargs = attributes["env_kwargs"]
+    return {name: kwargs[name] for name in sorted(kwargs) if name not in _SHOWN}

@@ -1,0 +1,133 @@
+"""The options of ``bin/Rollout.py``, for both of its uses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import tyro
+
+from robo_manip_baselines.data.images import DEFAULT_QUALITY
+from robo_manip_baselines.errors import RequestError
+
+EXAMPLE = """python bin/Rollout.py FeedingEnv --scripted --num_episodes 50 --workers 2
+
+Example: python bin/Rollout.py FeedingEnv --policy Act --checkpoint runs/act --video 4"""
+
+
+@dataclass(frozen=True)
+class ScriptedOptions:
+    """Only with --scripted."""
+
+    expert: str = "reactive"
+    """reactive: Algorithm 1 of the paper. anticipatory: aims where the mouth will be."""
+    image_codec: str = "jpeg"
+    """jpeg, png or raw."""
+    image_quality: int = DEFAULT_QUALITY
+    """Quality of jpeg, 1 to 100."""
+    preview: int = 2
+    """How many of the first episodes the preview video shows; 0 for no video."""
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """Only with --policy."""
+
+    checkpoint: Path | None = None
+    """Folder of a training run, or of one of its checkpoints."""
+    num_envs: int = 8
+    """Episodes that run at once; what they come to does not depend on it."""
+    temporal_ensemble: bool = False
+    """Average the predictions of all chunks, whatever the checkpoint says."""
+    execute: int | None = None
+    """Carry out so many actions of a chunk before the next, whatever the checkpoint says."""
+    device: str = "auto"
+    """Where the network runs: auto, cpu, cuda or cuda:1."""
+    precision: str = "fp32"
+    """fp32, or bf16 for autocast."""
+    video: int = 0
+    """Videos to write: of the first successes and the first failures, half of each."""
+    obs: str | None = None
+    """What the policy is shown; only checked, the checkpoint says it."""
+    horizon: int | None = None
+    """Likewise, the frames that it looks ahead."""
+    error: str | None = None
+    """Likewise, what stands between the true and the observed mouth."""
+    object_pose: bool = False
+    """Likewise, that it is shown where the cube is."""
+
+
+@dataclass(frozen=True)
+class RolloutOptions:
+    """Let a scripted expert record demonstrations (--scripted), or evaluate a trained policy
+    (--policy, --checkpoint).
+    """
+
+    env: tyro.conf.Positional[str]
+    """Environment, for example FeedingEnv."""
+    scripted: bool = False
+    """Let the scripted expert act, and write its episodes down."""
+    policy: str | None = None
+    """Let a trained policy act, for example Act, and write down how well it does."""
+    num_episodes: int = 50
+    """Episodes, one for each seed from --seed on."""
+    seed: int | None = None
+    """Seed of the first episode; if not given, 0 with --scripted and 1000 with --policy."""
+    out: Path | None = None
+    """Folder to write to; if not given, dataset/<env> or results/<env>_<run>."""
+    cameras: tuple[str, ...] | None = None
+    """Cameras to record, or none; all if not given. With --policy, only checked."""
+    image_size: str | None = None
+    """Height x width of images in pixels; 480x640 if not given. With --policy, only checked."""
+    face_motion: str | None = None
+    """When the face starts to move: with the episode, or after_lift. If not given, episode, or as
+    in the demonstrations of the policy."""
+    clips: tuple[str, ...] = ()
+    """Recorded clips to draw from; if not given, all, or those of the demonstrations."""
+    motion_library: Path | None = None
+    """File of recorded face motion; if not given, the one that ships with the package, or that of
+    the demonstrations."""
+    workers: int = 2
+    """Processes in which environments step; with --policy, 0 steps them in the main one."""
+    demonstration: tyro.conf.OmitArgPrefixes[ScriptedOptions] = field(
+        default_factory=ScriptedOptions
+    )
+    evaluation: tyro.conf.OmitArgPrefixes[PolicyOptions] = field(default_factory=PolicyOptions)
+
+    def __post_init__(self) -> None:
+        if self.scripted and self.policy is not None:
+            raise RequestError("--scripted and --policy: one of them acts; leave the other out")
+        if not self.scripted and self.policy is None:
+            raise RequestError(
+                "nothing acts; say --scripted to let the scripted expert act, or "
+                "--policy Act --checkpoint runs/... to let a trained policy act"
+            )
+        unused = self.evaluation if self.scripted else self.demonstration
+        if name := _first_difference(unused):
+            wanted = "--policy" if self.scripted else "--scripted"
+            raise RequestError(f"--{name} goes with {wanted}; leave it out")
+        if self.num_episodes < 1:
+            raise RequestError(f"num_episodes {self.num_episodes}: must be 1 or more")
+        if self.seed is not None and self.seed < 0:
+            raise RequestError(f"seed {self.seed}: must be 0 or more")
+
+    def seeds(self, first: int) -> range:
+        """Return the seeds of the episodes; ``first`` where none was given."""
+        start = first if self.seed is None else self.seed
+        return range(start, start + self.num_episodes)
+
+    def motion_arguments(self) -> dict[str, object]:
+        """Return the arguments of the environment about the recorded motion that were given."""
+        given = {
+            "face_motion": self.face_motion,
+            "clips": self.clips,
+            "motion_library": self.motion_library and str(self.motion_library),
+        }
+        return {name: value for name, value in given.items() if value}
+
+
+def _first_difference(options: ScriptedOptions | PolicyOptions) -> str | None:
+    """Name the first option that is not at its default."""
+    defaults = type(options)()
+    names = (item.name for item in fields(options))
+    return next((n for n in names if getattr(options, n) != getattr(defaults, n)), None)

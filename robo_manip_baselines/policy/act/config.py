@@ -1,0 +1,83 @@
+"""Settings of ACT. Importing this needs no PyTorch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from robo_manip_baselines.errors import RequestError
+
+_COUNTS = (
+    "chunk_size",
+    "hidden_size",
+    "feedforward_size",
+    "num_heads",
+    "encoder_layers",
+    "decoder_layers",
+    "latent_size",
+    "cvae_layers",
+)
+
+
+@dataclass(frozen=True)
+class ActConfig:
+    """What the network is (Zhao et al. 2023, "ACT"; the paper's Table III).
+
+    Attributes:
+        chunk_size: K, actions predicted at once (Table III: 100).
+        hidden_size: D, width of every token (Table III: 512); a multiple of 4 for the positions
+            of image features, and of ``num_heads``.
+        feedforward_size: width inside the feed-forward blocks (Table III: 3200).
+        num_heads: attention heads (public ACT: 8).
+        encoder_layers: of the Transformer over latent, state and image features (public ACT: 4).
+        decoder_layers: of the Transformer over the K queries (public ACT: 7, of which it reads
+            the first; see ``paper_compat``).
+        latent_size: Z, numbers of the latent style variable (public ACT: 32).
+        cvae_layers: of the Transformer over class token, state and actions that proposes the
+            latent in training (public ACT: 4).
+        use_cvae: whether there is a latent at all; without, it is 0 in training too and the KL
+            divergence is left out.
+        kl_weight: weight of the KL divergence in the loss (Table III: 10).
+        dropout: on the residual branches and inside the feed-forward blocks in training (public
+            ACT: 0.1). Attention weights are not dropped: that would need them in memory.
+        pre_norm: layer normalisation before each block instead of after it (public ACT: False).
+        backbone_learning_rate_factor: learning rate of the ResNet-18 as a multiple of the others'
+            (public ACT: 1e-5 for both, so 1); 0 keeps it as it is.
+        backbone_weights: file with the state dict of a torchvision ResNet-18 to start from,
+            ``.safetensors`` or ``.pth``; None starts from random weights.
+        paper_compat: compute what the public ACT code computes: actions are read off the first
+            decoder layer, padded steps count in the denominator of the L1 loss, and nothing tells
+            cameras apart. Otherwise the last layer, valid steps only, and a learned embedding for
+            each camera.
+
+    Raises:
+        RequestError: a value that is not valid.
+    """
+
+    chunk_size: int = 100
+    hidden_size: int = 512
+    feedforward_size: int = 3200
+    num_heads: int = 8
+    encoder_layers: int = 4
+    decoder_layers: int = 7
+    latent_size: int = 32
+    cvae_layers: int = 4
+    use_cvae: bool = True
+    kl_weight: float = 10.0
+    dropout: float = 0.1
+    pre_norm: bool = False
+    backbone_learning_rate_factor: float = 1.0
+    backbone_weights: str | None = None
+    paper_compat: bool = False
+
+    def __post_init__(self) -> None:
+        for name in _COUNTS:
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
+        for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
+            if self.hidden_size % divisor:
+                raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
+        for name in ("kl_weight", "backbone_learning_rate_factor"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more, and finite")
+        if not 0.0 <= self.dropout < 1.0:
+            raise RequestError(f"dropout {self.dropout}: must be 0 or more, less than 1")

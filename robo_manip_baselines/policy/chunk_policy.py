@@ -1,0 +1,131 @@
+"""A trained network as a policy: observations of many environments in, their next actions out.
+
+Legend: n slots that there are, b slots that act now, m of them that need a chunk, R rows of a
+tile, S elements of the state, N cameras, H and W image height and width, K actions of a chunk, A
+elements of an action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.errors import RequestError, require_choice
+from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.observation.vector import to_vector, vector_names
+from robo_manip_baselines.policy.chunking import Slots, make_chunking
+from robo_manip_baselines.policy.interface import PolicyModel
+from robo_manip_baselines.policy.presets import Acting
+
+PRECISIONS = ("fp32", "bf16")
+
+CUDA_TILE = 8
+"""Rows of a tile on a GPU, where eight cost little more than one."""
+
+
+class ChunkPolicy:
+    """What ``evaluation.rollout`` asks for actions.
+
+    The network always runs on tiles of the same number of rows, the last one filled up with zeros:
+    matrix products of other shapes are rounded otherwise, and an episode would come out differently
+    for the number of environments beside it. On a CPU a tile is one row, which costs nothing there.
+
+    Args:
+        model: the network; it is moved to the device and put into evaluation mode.
+        spec: what the policy is shown.
+        normalization: of the demonstrations that it was trained on.
+        acting: how chunks become actions.
+        slots: n.
+        device: where the network runs.
+        precision: ``fp32``, or ``bf16`` for autocast.
+        tile: R; 1 on a CPU and ``CUDA_TILE`` elsewhere if None.
+
+    Raises:
+        RequestError: a value that is not valid.
+    """
+
+    def __init__(
+        self,
+        model: PolicyModel,
+        spec: ObservationSpec,
+        normalization: Normalization,
+        acting: Acting,
+        *,
+        slots: int,
+        device: torch.device | str = "cpu",
+        precision: str = "fp32",
+        tile: int | None = None,
+    ) -> None:
+        self._device = torch.device(device)
+        self._is_bf16 = require_choice("precision", precision, PRECISIONS) == "bf16"
+        self._model = model.to(self._device).eval()
+        if spec.cameras:
+            self._model = self._model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._spec, self._normalization = spec, normalization
+        self._chunking = make_chunking(
+            acting, slots, model.chunk_size, len(normalization.action_mean)
+        )
+        rows = tile or (1 if self._device.type == "cpu" else CUDA_TILE)
+        # The same memory for every tile: pinned, so that a GPU can fetch it by itself.
+        pinned = self._device.type == "cuda"
+        self._state = torch.zeros(rows, len(vector_names(spec)), pin_memory=pinned)
+        shape = (rows, len(spec.cameras), *spec.image_size, 3)
+        self._images = torch.zeros(shape, dtype=torch.uint8, pin_memory=pinned)
+
+    def reset(self, slots: Slots) -> None:
+        """Start episodes in these slots."""
+        self._chunking.reset(slots)
+
+    def looks(self, slots: Slots) -> NDArray[np.bool_]:
+        """Say, (b,), which slots will look at their cameras when they act next."""
+        return self._chunking.needs_chunk(slots)
+
+    def act(self, observations: Mapping[str, NDArray[Any]], slots: Slots) -> NDArray[np.float32]:
+        """Return the next actions (b, A) in the units of the environment.
+
+        Args:
+            observations: each of the spec's keys, (b, ...); images of slots that do not look may
+                hold anything.
+            slots: (b,) the slots that they come from.
+
+        Raises:
+            RequestError: the network gives numbers that are not finite.
+        """
+        rows = np.flatnonzero(self._chunking.needs_chunk(slots))
+        state = self._normalization.normalized_state(to_vector(self._spec, observations))
+        views = [observations[key] for key in self._spec.image_keys()]
+        size = len(self._state)
+        chunks = [
+            self._predict(state, views, rows[start : start + size])
+            for start in range(0, len(rows), size)
+        ]
+        shape = (0, self._model.chunk_size, len(self._normalization.action_mean))
+        planned = np.concatenate(chunks) if chunks else np.empty(shape, np.float32)
+        if not np.isfinite(planned).all():
+            raise RequestError("the network gives actions that are not finite; train it again")
+        return self._normalization.action(self._chunking.act(slots, planned))
+
+    @torch.inference_mode()
+    def _predict(
+        self, state: NDArray[np.float32], views: list[NDArray[np.uint8]], rows: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """Return the chunks, normalised, (r, K, A), of at most one tile's worth of rows."""
+        count = len(rows)
+        self._state.zero_()
+        self._state.numpy()[:count] = state[rows]
+        images = None
+        if views:
+            self._images[count:].zero_()
+            for camera, view in enumerate(views):
+                self._images.numpy()[:count, camera] = view[rows]
+            images = self._images.to(self._device, non_blocking=True)
+        inputs = self._state.to(self._device, non_blocking=True)
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._is_bf16):
+            chunks = self._model.predict(inputs, images)
+        # Waits for the GPU, so that the pinned memory is free for the next tile.
+        return chunks[:count].float().cpu().numpy()

@@ -1,0 +1,49 @@
+"""Settings of the perceptron."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.policy.presets import Acting, PolicyPreset
+from robo_manip_baselines.training.settings import TrainSettings
+
+
+@dataclass(frozen=True)
+class MlpConfig:
+    """What the perceptron is.
+
+    Attributes:
+        chunk_size: K, actions predicted at once.
+        hidden_size: width of each hidden layer.
+        hidden_layers: how many there are.
+        dropout: before the last layer.
+
+    Raises:
+        RequestError: a value that is not valid.
+    """
+
+    chunk_size: int = 20
+    hidden_size: int = 512
+    hidden_layers: int = 3
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("chunk_size", "hidden_size", "hidden_layers"):
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
+        if not 0.0 <= self.dropout < 1.0:
+            raise RequestError(f"dropout {self.dropout}: must be 0 or more, less than 1")
+
+
+PRESETS = {
+    "cpu": PolicyPreset(
+        config=MlpConfig(),
+        training=TrainSettings(
+            batch_size=256, learning_rate=1e-3, schedule="cosine", sampler="frame", steps=10_000
+        ),
+        acting=Acting(temporal_ensemble=True),
+        cameras=(),
+        object_pose=True,
+    )
+}

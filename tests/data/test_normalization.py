@@ -1,0 +1,88 @@
+"""Scaling vectors: what is measured, that it can be undone, and that it survives a JSON file."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robo_manip_baselines.data.normalization import SMALLEST_STD, Normalization
+from robo_manip_baselines.errors import RequestError
+
+FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
+POSITIVE = st.floats(min_value=2.0**-126, width=32, allow_infinity=False)
+
+
+def measured(rows: int = 40, seed: int = 0) -> tuple[Normalization, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    state = rng.normal([5.0, -2.0, 0.0], [0.5, 3.0, 1.0], (rows, 3)).astype(np.float32)
+    action = rng.uniform(-1.0, 1.0, (rows, 2)).astype(np.float32)
+    return Normalization.of(state, action), state, action
+
+
+def test_training_rows_come_out_with_mean_0_and_deviation_1() -> None:
+    normalization, state, action = measured()
+    for scaled in (normalization.normalized_state(state), normalization.normalized_action(action)):
+        assert scaled.dtype == np.float32
+        # float32 arithmetic on numbers of a few units: 1e-6 relative.
+        np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=1e-5)
+        np.testing.assert_allclose(scaled.std(axis=0), 1.0, atol=1e-5)
+
+
+def test_actions_come_back() -> None:
+    normalization, _, action = measured()
+    back = normalization.action(normalization.normalized_action(action))
+    np.testing.assert_allclose(back, action, atol=1e-6)
+
+
+def test_sums_do_not_lose_small_motion_on_a_large_offset() -> None:
+    # float32 holds 1000.3 to 6e-5; summed up in float32, the mean would be off by 0.3.
+    state = (1000.3 + 0.01 * np.tile([[-1.0] * 2, [1.0] * 2], (50_000, 1))).astype(np.float32)
+    normalization = Normalization.of(state, state)
+    np.testing.assert_allclose(normalization.state_std, 0.01, rtol=1e-2)
+
+
+def test_nearly_constant_elements_are_not_blown_up() -> None:
+    state = np.full((10, 2), 0.3, np.float32)
+    state[0, 1] += 1e-5
+    normalization = Normalization.of(state, state)
+    np.testing.assert_array_equal(normalization.state_std, np.float32(SMALLEST_STD))
+    assert np.abs(normalization.normalized_state(state)).max() < 0.02
+
+
+@given(st.lists(st.tuples(FINITE, POSITIVE), min_size=1, max_size=6))
+def test_a_json_file_keeps_every_bit(columns: list[tuple[float, float]]) -> None:
+    mean, std = np.array(columns, dtype=np.float32).T
+    given = Normalization(mean, std, mean[:1], std[:1])
+    read = Normalization.from_json(json.loads(json.dumps(given.to_json(), allow_nan=False)))
+    for name in ("state_mean", "state_std", "action_mean", "action_std"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(given, name), strict=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("action_std"), "'action_std' is missing"),
+        (lambda d: d.update(state_mean=3.0), "'state_mean' is missing, or no list of numbers"),
+        (lambda d: d.update(state_mean=["1", "2", "3"]), "'state_mean' is .* no list of numbers"),
+        (lambda d: d.update(state_mean=[True, 0.0, 0.0]), "'state_mean' is .* no list of numbers"),
+        (lambda d: d.update(state_mean=[1.0, 2.0]), "2 of 'state_mean', 3 of its std"),
+        (lambda d: d.update(state_std=[1.0, 0.0, 1.0]), "'state_std' must be more than 0"),
+        (lambda d: d.update(action_std=[1.0, -1.0]), "'action_std' must be more than 0"),
+        (lambda d: d.update(action_mean=[1.0, float("nan")]), "'action_mean' is not finite"),
+        (lambda d: d.update(action_std=[1.0, float("inf")]), "'action_std' is not finite"),
+    ],
+)
+def test_what_is_no_normalisation_is_refused(change: object, message: str) -> None:
+    data = measured()[0].to_json()
+    change(data)  # type: ignore[operator]
+    with pytest.raises(RequestError, match=message):
+        Normalization.from_json(data)
+
+
+def test_something_else_altogether_is_refused() -> None:
+    with pytest.raises(RequestError, match="'state_mean' is missing"):
+        Normalization.from_json([1, 2])

@@ -1,0 +1,79 @@
+"""A policy that nobody trained, and episodes that are over soon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.data.split import Split
+from robo_manip_baselines.envs.mujoco.face_env import world_of
+from robo_manip_baselines.evaluation.task import Task
+from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
+from robo_manip_baselines.policy.mlp.config import MlpConfig
+from robo_manip_baselines.policy.mlp.model import MlpModel
+from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.policy.sizes import Sizes
+from robo_manip_baselines.training.settings import TrainSettings
+
+SPEC = ObservationSpec(obs="current_pred", cameras=(), object_pose=True)
+STEPS = 30
+
+MakeCheckpoint = Callable[..., Checkpoint]
+
+
+@pytest.fixture(scope="session")
+def task() -> Task:
+    """The environment of ``make_checkpoint``."""
+    return Task("FeedingEnv", SPEC, {"max_episode_steps": STEPS})
+
+
+@pytest.fixture(scope="session")
+def make_checkpoint(task: Task) -> MakeCheckpoint:
+    """Write a small perceptron into a folder; it moves the arm about its home pose."""
+    with closing(task.make()) as env:
+        world = world_of(env)
+        names, xml_hash = tuple(world.action_names), world.xml_hash
+        middle = world.data.ctrl[world._actuators].astype(np.float32)
+
+    def make(folder: Path, **changes: object) -> Checkpoint:
+        config = MlpConfig(chunk_size=6, hidden_size=16, hidden_layers=1)
+        sizes = Sizes(task.vector_size, task.action_size, 0, SPEC.image_size)
+        model = MlpModel(config, sizes)
+        generator = torch.Generator().manual_seed(0)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.3)
+        facts = {
+            "policy": "Mlp",
+            "config": config,
+            "sizes": sizes,
+            "spec": SPEC,
+            "env": "FeedingEnv",
+            "acting": Acting(),
+            "normalization": Normalization(
+                np.zeros(sizes.state, np.float32),
+                np.ones(sizes.state, np.float32),
+                middle,
+                np.full(sizes.action, 0.05, np.float32),
+            ),
+            "action_names": names,
+            "control_period": 0.02,
+            "xml_hash": xml_hash,
+            "step": 5,
+            "train_seed": 3,
+            "settings": TrainSettings(steps=5),
+            "split": Split(train=(0, 1), validation=(2,)),
+            "dataset": {"env_kwargs": task.env_kwargs},
+            "versions": {"robo_manip_baselines": "0.0.9"},
+        }
+        checkpoint = Checkpoint(folder=folder, **{**facts, **changes})
+        return write_checkpoint(folder, checkpoint, model.state_dict(), {}, {})
+
+    return make

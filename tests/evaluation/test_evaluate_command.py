@@ -1,0 +1,242 @@
+"""``bin/Rollout.py --policy`` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from robo_manip_baselines.command import parse
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.evaluation.evaluate_command import evaluate
+from robo_manip_baselines.evaluation.evaluation import arm_name, choose_acting, plan, run_name
+from robo_manip_baselines.evaluation.results_file import read_results
+from robo_manip_baselines.expert.rollout_options import EXAMPLE, PolicyOptions, RolloutOptions
+from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.policy.checkpoint import Checkpoint
+from robo_manip_baselines.policy.presets import Acting
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).resolve().parents[2]
+ROLLOUT = [sys.executable, str(ROOT / "bin" / "Rollout.py")]
+
+MakeCheckpoint = Callable[..., Checkpoint]
+
+
+@pytest.fixture(scope="module")
+def run_folder(make_checkpoint: MakeCheckpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with one checkpoint."""
+    run = tmp_path_factory.mktemp("runs") / "mlp_run"
+    make_checkpoint(run / "checkpoints" / "step_00000005")
+    return run
+
+
+def options(run: Path, text: str = "", **changes: object) -> RolloutOptions:
+    words = f"FeedingEnv --policy Mlp --checkpoint {run} --workers 0 --num_episodes 3 {text}"
+    return replace(parse(RolloutOptions, EXAMPLE, args=words.split()), **changes)
+
+
+def test_evaluates_and_carries_on(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    once, pieces = tmp_path / "once", tmp_path / "pieces"
+    evaluate(options(run_folder, out=once))
+    table = capsys.readouterr().out
+    assert "success             0/3  0.0% (95 % interval 0.0% to 56.1%)" in table
+    assert "failures            never_grasped 3" in table
+    results = read_results(once)
+    assert [result.seed for result in results] == [1000, 1001, 1002]
+    assert {(r.policy, r.arm, r.train_seed, r.steps) for r in results} == {
+        ("Mlp", "current_pred_h2", 3, 30)
+    }
+    assert all(len(result.checkpoint) == 64 and result.versions["torch"] for result in results)
+    summary = json.loads((once / "summary.json").read_text())
+    assert (summary["episodes"], summary["failures"]["never_grasped"]) == (3, 3)
+
+    evaluate(options(run_folder, "--seed 1001 --num_episodes 1 --num_envs 1", out=pieces))
+    kept = (pieces / "results.jsonl").read_text()
+    evaluate(options(run_folder, "--num_envs 3 --workers 1", out=pieces))
+    assert (pieces / "results.jsonl").read_bytes() == (once / "results.jsonl").read_bytes()
+    assert kept in (pieces / "results.jsonl").read_text()
+    assert json.loads((pieces / "summary.json").read_text())["episodes"] == 3
+    # Nothing left to do: the same table, nothing rewritten differently.
+    capsys.readouterr()
+    evaluate(options(run_folder, out=pieces))
+    assert "speed               -" in capsys.readouterr().out
+
+
+def test_results_of_another_way_of_acting_are_not_mixed(run_folder: Path, tmp_path: Path) -> None:
+    evaluate(options(run_folder, "--num_episodes 1 --execute 3", out=tmp_path))
+    with pytest.raises(RequestError, match="holds results with acting"):
+        evaluate(options(run_folder, "--num_episodes 1", out=tmp_path))
+
+
+def test_killed_and_interrupted_it_goes_on_to_the_same_file(
+    run_folder: Path, tmp_path: Path
+) -> None:
+    arguments = f"FeedingEnv --policy Mlp --checkpoint {run_folder} --num_envs 2 --workers 2"
+    many = [*ROLLOUT, *arguments.split(), "--num_episodes", "100000"]
+    once, out = tmp_path / "once", tmp_path / "stopped"
+    for number, code in ((signal.SIGKILL, -9), (signal.SIGINT, 130)):
+        before = len(read_results(out)) if out.exists() else 0
+        process = subprocess.Popen(
+            [*many, "--out", str(out)],
+            cwd=tmp_path,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        results = out / "results.jsonl"
+        deadline = time.monotonic() + 60
+        while not (results.exists() and len(read_results(out)) > before + 1):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        if number == signal.SIGKILL:
+            process.kill()  # the workers have to notice by themselves
+        else:
+            os.killpg(process.pid, number)  # as a terminal does it
+        _, errors = process.communicate(timeout=30)
+        assert process.returncode == code
+        assert "Traceback" not in errors
+        if code == 130:
+            assert errors.splitlines()[-1] == "interrupted"
+        while children_of_group(process.pid):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    done = max(result.seed for result in read_results(out)) - 1000
+    for folder in (out, once):
+        evaluate(options(run_folder, out=folder, num_episodes=done + 1))
+    assert (out / "results.jsonl").read_bytes() == (once / "results.jsonl").read_bytes()
+
+
+def children_of_group(group: int) -> list[int]:
+    """Processes of a process group that are still there, zombies apart."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, process_group = stat.read_text().rpartition(")")[2].split()[:3]
+        except OSError:
+            continue
+        if int(process_group) == group and state != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("--policy Atc", "unknown policy 'Atc' (did you mean 'Act'?)"),
+        ("--policy Act", "trained with policy Mlp, not Act"),
+        ("--scripted", "--scripted and --policy: one of them acts"),
+        ("--expert anticipatory", "--expert goes with --scripted"),
+        ("--preview 1", "--preview goes with --scripted"),
+        ("--obs current", "trained with obs current_pred, not current"),
+        ("--horizon 3", "trained with horizon 2, not 3"),
+        ("--cameras top,angle", "trained with cameras none, not top,angle"),
+        ("--image_size 24x32", "trained with image_size 480x640, not 24x32"),
+        ("--checkpoint nowhere", "checkpoint 'nowhere' does not exist"),
+        ("--temporal_ensemble --execute 2", "--temporal_ensemble and --execute: say one"),
+        ("--execute 0", "execute 0"),
+        ("--execute 7", "execute 7: must be 1 to 6"),
+        ("--num_envs 0", "num_envs 0"),
+        ("--workers -1", "workers -1"),
+        ("--video -1", "video -1"),
+        ("--num_episodes 0", "num_episodes 0"),
+        ("--seed -5", "seed -5"),
+        ("--device abacus", "device 'abacus'"),
+        ("--precision fp8", "unknown precision 'fp8'"),
+        ("--clips me", "unknown clip 'me'"),
+        ("--face_motion no", "unknown face motion 'no'"),
+    ],
+)
+def test_wrong_requests(run_folder: Path, tmp_path: Path, text: str, message: str) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(RequestError) as raised:
+        evaluate(options(run_folder, f"{text} --out {out}"))
+    assert message in str(raised.value)
+    assert not (out / "results.jsonl").exists() or not read_results(out)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("FeedingEnv", "nothing acts"),
+        ("FeedingEnv --policy Act", "which checkpoint?"),
+        ("FeedinEnv --policy Act", "unknown environment 'FeedinEnv'"),
+        ("FeedingEnv --scripted --checkpoint runs/x", "--checkpoint goes with --policy"),
+        ("FeedingEnv --scripted --execute 3", "--execute goes with --policy"),
+    ],
+)
+def test_wrong_requests_get_one_line_and_exit_code_2(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    result = subprocess.run(
+        [*ROLLOUT, *text.split()], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 2, result.stderr
+    assert message in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"xml_hash": "0" * 64}, "trained with model hash 000000000000; FeedingEnv has"),
+        (
+            {"action_names": ("left/waist",)},
+            "trained with actions left/waist; FeedingEnv has right",
+        ),
+        ({"control_period": 0.05}, "trained with control period 0.05; FeedingEnv has 0.02"),
+    ],
+)
+def test_an_environment_that_does_not_fit_is_refused(
+    make_checkpoint: MakeCheckpoint, tmp_path: Path, changes: dict[str, object], message: str
+) -> None:
+    make_checkpoint(tmp_path / "other", **changes)
+    with pytest.raises(RequestError, match=message) as raised:
+        plan(options(tmp_path / "other"))
+    assert "0.0.9" in str(raised.value)
+
+
+def test_seeds_of_demonstrations_are_pointed_out(
+    run_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    evaluate(options(run_folder, "--seed 2", out=tmp_path))
+    assert "1 of the seeds are those of demonstrations, 2 among them" in caplog.text
+
+
+def test_the_checkpoint_says_how_to_act_unless_told_otherwise() -> None:
+    trained = Acting(temporal_ensemble=False, decay=0.1, execute=4)
+    assert choose_acting(trained, PolicyOptions()) == trained
+    assert choose_acting(trained, PolicyOptions(execute=2)) == replace(trained, execute=2)
+    ensemble = choose_acting(trained, PolicyOptions(temporal_ensemble=True))
+    assert (ensemble.temporal_ensemble, ensemble.decay) == (True, 0.1)
+
+
+def test_options_of_the_environment_come_from_the_demonstrations(
+    run_folder: Path, make_checkpoint: MakeCheckpoint, tmp_path: Path
+) -> None:
+    make_checkpoint(tmp_path / "late", dataset={"env_kwargs": {"face_motion": "after_lift"}})
+    assert plan(options(tmp_path / "late")).task.env_kwargs == {"face_motion": "after_lift"}
+    given = plan(options(tmp_path / "late", "--face_motion episode"))
+    assert given.task.env_kwargs == {"face_motion": "episode"}
+    assert plan(options(run_folder)).seeds == range(1000, 1003)
+
+
+def test_names() -> None:
+    assert arm_name(ObservationSpec()) == "baseline"
+    assert arm_name(ObservationSpec(obs="current_pred", horizon=5)) == "current_pred_h5"
+    assert run_name(Path("runs/act_current")) == "act_current"
+    assert run_name(Path("runs/x/checkpoints/step_00000005")) == "x_step_00000005"

@@ -1,0 +1,118 @@
+"""Kinds of failure: every way of failing has one, at the boundaries too."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from robo_manip_baselines.evaluation.episode_watch import EpisodeWatch
+from robo_manip_baselines.evaluation.failure import FAILURES, failure_kind
+from robo_manip_baselines.evaluation.result import Offset
+
+BELOW = float(np.nextafter(0.03, 0.0))  # m, just within the tolerance along x
+
+
+@pytest.mark.parametrize(
+    ("offset", "released", "kind"),
+    [
+        (None, False, "never_grasped"),
+        # Not at the mouth's depth: what counts is whether the cube was still there.
+        ((0.15, 0.0, 0.0), True, "dropped"),
+        ((0.15, 0.0, 0.0), False, "too_late"),
+        ((0.03, 0.0, 0.0), True, "dropped"),
+        ((0.03, 0.0, 0.0), False, "too_late"),
+        ((-0.03, 0.0, 0.0), False, "too_late"),
+        ((0.031, 0.2, -0.3), False, "too_late"),
+        # At its depth: the larger part across the face; letting go beside the mouth is a miss.
+        ((BELOW, 0.0, 0.012), False, "missed_high"),
+        ((BELOW, 0.0, 0.012), True, "missed_high"),
+        ((-BELOW, 0.0, -0.012), True, "missed_low"),
+        ((0.0, 0.012, 0.0), True, "missed_left"),
+        ((0.0, -0.012, 0.0), False, "missed_right"),
+        ((0.0, 0.011, 0.012), False, "missed_high"),
+        ((0.0, 0.012, -0.011), False, "missed_left"),
+        ((0.0, -0.012, 0.012), False, "missed_high"),  # a tie goes up or down
+        ((0.0, 0.01, 0.0), False, "missed_left"),  # the tolerance itself is outside
+        ((0.0, 0.0, -0.01), False, "missed_low"),
+        # Within all tolerances, and yet no success: it was not held by both fingers.
+        ((0.0, 0.009, 0.009), False, "dropped"),
+        ((0.0, 0.0, 0.0), True, "dropped"),
+    ],
+)
+def test_boundaries(offset: Offset | None, released: bool, kind: str) -> None:
+    assert failure_kind(is_success=False, was_released=released, closest_offset=offset) == kind
+    assert failure_kind(is_success=True, was_released=released, closest_offset=offset) == ""
+
+
+def test_every_combination_of_facts_has_a_known_kind_and_every_kind_occurs() -> None:
+    steps = (-0.2, -0.03, -0.01, 0.0, 0.009, 0.01, 0.029, 0.03, 0.2)
+    offsets: list[Offset | None] = [None, *itertools.product(steps, repeat=3)]
+    kinds = {
+        failure_kind(is_success=False, was_released=released, closest_offset=offset)
+        for released in (False, True)
+        for offset in offsets
+    }
+    assert kinds == set(FAILURES)
+
+
+def info(phase: str, gripper: tuple[float, float, float], **changes: object) -> dict[str, object]:
+    """The mouth is at (0, 0.5, 0.35)."""
+    return {
+        "phase": phase,
+        "gripper_position": np.array(gripper),
+        "mouth_position": np.array([0.0, 0.5, 0.35]),
+        "face_force": 0.0,
+        "is_success": False,
+        "is_success_strict": False,
+        "completion_time": None,
+        "time_since_lift": None,
+        **changes,
+    }
+
+
+def watched(*infos: dict[str, object]) -> EpisodeWatch:
+    watch = EpisodeWatch("FeedingEnv", 7, "clip", "person")
+    for one in infos:
+        watch.see(one)
+    return watch
+
+
+def test_the_closest_approach_counts_only_while_the_cube_is_carried() -> None:
+    at_mouth = (0.0, 0.5, 0.35)
+    last = info("release", at_mouth, face_force=2.0, time_since_lift=0.1 + 0.2)
+    watch = watched(
+        info("reach", at_mouth),
+        info("grasp", at_mouth, face_force=3.5),
+        info("carry", (0.10, 0.5, 0.35)),
+        info("carry", (0.02, 0.5, 0.33)),
+        info("release", at_mouth),
+        last,
+    )
+    result = watch.result(last)
+    assert (result.steps, result.face_force) == (6, 3.5)
+    assert result.time_since_lift == 0.3  # without what floating point adds
+    assert result.closest_distance == pytest.approx(np.hypot(0.02, 0.02))
+    assert result.closest_offset == pytest.approx((0.02, 0.0, -0.02))
+    assert result.failure == "missed_low"
+
+
+def test_nearest_is_meant_in_units_of_the_tolerances() -> None:
+    """2.9 cm out is nearer than 2 cm low: it is within the tolerance, the other is twice it."""
+    watch = watched(info("carry", (0.029, 0.5, 0.35)), info("carry", (0.0, 0.5, 0.33)))
+    result = watch.result(info("carry", (0.0, 0.5, 0.33)))
+    assert result.closest_offset == pytest.approx((0.029, 0.0, 0.0))
+    assert result.closest_distance == pytest.approx(0.02)
+
+
+def test_without_a_lift_there_is_no_closest_approach() -> None:
+    result = watched(info("grasp", (0.0, 0.5, 0.35))).result(info("reach", (0.0, 0.5, 0.35)))
+    assert (result.closest_distance, result.closest_offset) == (None, None)
+    assert result.failure == "never_grasped"
+
+
+def test_a_success_has_no_kind_of_failure() -> None:
+    last = info("deliver", (0.0, 0.5, 0.35), is_success=True, completion_time=4.3)
+    result = watched(last).result(last)
+    assert (result.is_success, result.failure, result.completion_time) == (True, "", 4.3)

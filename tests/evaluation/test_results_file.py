@@ -1,0 +1,171 @@
+"""Results on disk: whole lines, never twice the same seed, never of two settings."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.evaluation.result import EpisodeResult
+from robo_manip_baselines.evaluation.results_file import (
+    MANIFEST,
+    RESULTS,
+    ResultsFile,
+    read_results,
+)
+
+SETTINGS = {"env": "a/FeedingEnv-v0", "acting": {"execute": 1}, "size": (480, 640)}
+MISS = EpisodeResult(
+    env="FeedingEnv",
+    seed=1003,
+    is_success=False,
+    is_success_strict=False,
+    completion_time=None,
+    time_since_lift=8.02,
+    steps=600,
+    failure="missed_low",
+    closest_distance=0.0123,
+    closest_offset=(0.001, -0.002, -0.012),
+    face_force=1.5,
+    motion_clip="clip",
+    motion_subject="person",
+    policy="Act",
+    arm="current_pred_h2",
+    train_seed=0,
+    checkpoint="ab12",
+    versions={"numpy": "2"},
+)
+NEVER = replace(
+    MISS,
+    seed=1001,
+    time_since_lift=None,
+    failure="never_grasped",
+    closest_distance=None,
+    closest_offset=None,
+)
+HIT = replace(MISS, seed=1002, is_success=True, completion_time=4.0, failure="")
+
+
+@pytest.mark.parametrize("result", [MISS, NEVER, HIT])
+def test_a_line_gives_the_result_back(result: EpisodeResult) -> None:
+    line = result.to_line()
+    assert "\n" not in line
+    assert EpisodeResult.from_line(line) == result
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": "3"}, "'seed' is \"3\""),
+        ({"seed": True}, "'seed' is true"),
+        ({"is_success": 1}, "'is_success' is 1"),
+        ({"closest_offset": [0.0, 0.0]}, "'closest_offset' is"),
+        ({"failure": "bored"}, "'failure' is \"bored\""),
+        ({"versions": {"numpy": 2}}, "'versions' is"),
+        ({"mood": "good"}, "'mood' is unknown"),
+    ],
+)
+def test_a_line_of_another_form_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        EpisodeResult.from_line(json.dumps({**json.loads(MISS.to_line()), **changes}))
+
+
+def test_a_line_without_a_field_is_refused() -> None:
+    values = json.loads(MISS.to_line())
+    del values["face_force"]
+    with pytest.raises(ValueError, match="'face_force' is missing"):
+        EpisodeResult.from_line(json.dumps(values))
+
+
+def test_numbers_that_json_does_not_know_are_not_written() -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        replace(MISS, face_force=float("nan")).to_line()
+
+
+def open_file(folder: Path, **changes: Any) -> ResultsFile:
+    return ResultsFile(folder, {**SETTINGS, **changes}, {"arm": "current"})
+
+
+def test_lines_are_there_at_once_and_by_seed_in_the_end(tmp_path: Path) -> None:
+    with open_file(tmp_path) as file:
+        file.append(MISS)
+        assert (tmp_path / RESULTS).read_text() == MISS.to_line() + "\n"
+        file.append(NEVER)
+        assert file.of([1001, 1002, 1003]) == [NEVER, MISS]
+    assert read_results(tmp_path) == [NEVER, MISS]
+    lines = (tmp_path / RESULTS).read_text().splitlines()
+    assert lines == [NEVER.to_line(), MISS.to_line()]
+    manifest = json.loads((tmp_path / MANIFEST).read_text())
+    assert manifest["arm"] == "current"
+
+
+@pytest.mark.parametrize("cut", [1, 50, 10_000])
+def test_a_killed_run_goes_on(tmp_path: Path, cut: int) -> None:
+    with contextlib.suppress(KeyboardInterrupt), open_file(tmp_path) as file:
+        file.append(MISS)
+        raise KeyboardInterrupt
+    torn = HIT.to_line()[:-1][:cut]
+    with (tmp_path / RESULTS).open("a") as stream:
+        stream.write(torn)
+    assert read_results(tmp_path) == [MISS]
+    with open_file(tmp_path) as file:
+        assert file.done == {1003: MISS}
+        file.append(HIT)
+        file.append(NEVER)
+    assert read_results(tmp_path) == [NEVER, HIT, MISS]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"acting": {"execute": 2}}, r"holds results with acting \{'execute': 1\}, not"),
+        ({"checkpoint": "ff"}, "holds results with checkpoint None, not ff"),
+        ({"size": (240, 320)}, "holds results with size"),
+    ],
+)
+def test_results_of_other_settings_are_not_mixed(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    with open_file(tmp_path) as file:
+        file.append(MISS)
+    before = (tmp_path / RESULTS).read_bytes()
+    with pytest.raises(RequestError, match=message):
+        open_file(tmp_path, **changes)
+    open_file(tmp_path)
+    assert (tmp_path / RESULTS).read_bytes() == before
+
+
+def test_damage_is_named_with_its_line(tmp_path: Path) -> None:
+    with open_file(tmp_path) as file:
+        file.append(MISS)
+        file.append(HIT)
+    path = tmp_path / RESULTS
+    whole = path.read_text()
+    path.write_text(whole.replace('"seed": 1003', '"seed": 10x3'))
+    with pytest.raises(RequestError, match=r"results.jsonl', line 2 is damaged"):
+        read_results(tmp_path)
+    path.write_text(whole + HIT.to_line() + "\n")
+    with pytest.raises(RequestError, match="two lines for seed 1002"):
+        open_file(tmp_path)
+
+
+def test_folders_that_are_not_ours_are_left_alone(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="cannot be read"):
+        read_results(tmp_path)
+    (tmp_path / RESULTS).write_text("")
+    with pytest.raises(RequestError, match=r"without evaluation\.json"):
+        open_file(tmp_path)
+    (tmp_path / MANIFEST).write_text("{}")
+    with pytest.raises(RequestError, match="is damaged"):
+        open_file(tmp_path)
+    (tmp_path / MANIFEST).write_text('{"schema": "x", "version": 9, "settings": {}}')
+    with pytest.raises(RequestError, match="is of x version 9"):
+        open_file(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RequestError, match="cannot write"):
+        open_file(tmp_path / "file" / "below")

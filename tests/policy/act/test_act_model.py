@@ -1,0 +1,342 @@
+"""The whole network: what it counts, what it sees, and what may not change its losses.
+
+Legend: B batch, K actions of a chunk, A elements of an action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.policy.act.backbone import ResNet18
+from robo_manip_baselines.policy.act.config import ActConfig
+from robo_manip_baselines.policy.act.model import ActModel
+from robo_manip_baselines.policy.interface import Batch, Sizes
+
+BLIND = Sizes(state=5, action=3, cameras=0, image=(40, 70))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "settings", "total", "trained"),
+    [
+        (Sizes(14, 7, 3, (480, 640)), {}, 83_916_935, 83_916_935),
+        (Sizes(29, 7, 3, (480, 640)), {}, 83_932_295, 83_932_295),
+        (Sizes(14, 7, 0, (480, 640)), {}, 72_485_831, 72_485_831),
+        # Public ACT, two arms of 7 joints: 83,923,087 with an output that it never uses (513).
+        (Sizes(14, 14, 3, (480, 640)), {"paper_compat": True}, 83_922_574, 51_613_582),
+        (Sizes(14, 7, 3, (480, 640)), {"paper_compat": True}, 83_915_399, 51_606_407),
+        (Sizes(14, 7, 3, (480, 640)), {"use_cvae": False}, 66_539_079, 66_539_079),
+    ],
+)
+def test_how_many_parameters_there_are(
+    sizes: Sizes, settings: dict[str, Any], total: int, trained: int
+):
+    with torch.device("meta"):  # counted without numbers
+        model = ActModel(ActConfig(**settings), sizes)
+    assert sum(p.numel() for p in model.parameters()) == total
+    assert sum(p.numel() for p in model.parameters() if p.requires_grad) == trained
+
+
+def numpy_losses(model: ActModel, batch: Batch, compat: bool) -> tuple[float, float]:
+    """The two parts of the loss, from their definitions."""
+    assert model.cvae is not None
+    mean, log_variance = model.cvae(batch.state, batch.action, batch.is_pad)
+    latent = mean + torch.exp(log_variance / 2) * batch.noise
+    found = model._actions(batch.state, batch.images, latent).detach().numpy().astype(float)
+    error = np.abs(found - batch.action.numpy())
+    valid = ~batch.is_pad.numpy()
+    l1 = error[valid].sum() / error.size if compat else error[valid].mean()
+    posterior = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
+    kl = torch.distributions.kl_divergence(posterior, torch.distributions.Normal(0.0, 1.0))
+    return float(l1), kl.sum(1).mean().item()
+
+
+@pytest.mark.parametrize("compat", [False, True])
+def test_the_loss_is_its_definition(make_model, make_batch, compat: bool):
+    model, batch = make_model(paper_compat=compat), make_batch()
+    losses = {name: value.item() for name, value in model.loss(batch).items()}
+    l1, kl = numpy_losses(model, batch, compat)
+    assert losses["l1"] == pytest.approx(l1, rel=1e-5)  # fp32
+    assert losses["kl"] == pytest.approx(kl, rel=1e-5)
+    assert losses["loss"] == pytest.approx(l1 + 10.0 * kl, rel=1e-5)
+
+
+@pytest.mark.parametrize("compat", [False, True])
+def test_processes_that_share_a_batch_average_to_the_whole(make_model, make_batch, compat: bool):
+    model, batch = make_model(BLIND, paper_compat=compat), make_batch(BLIND)
+    whole = gradients(model, batch)
+    shares = []
+    for examples in (slice(0, 1), slice(1, 3)):
+        tensors = ("state", "action", "is_pad", "noise")
+        share = replace(batch, **{name: getattr(batch, name)[examples] for name in tensors})
+        counts = {"num_valid": batch.num_valid / 2, "num_examples": batch.num_examples / 2}
+        shares.append(gradients(model, replace(share, **counts)))
+    for name, gradient in whole.items():
+        mean = (shares[0][name] + shares[1][name]) / 2
+        torch.testing.assert_close(mean, gradient, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("compat", [False, True])
+def test_an_example_that_is_all_padding_is_none(make_model, make_batch, compat: bool):
+    model, batch = make_model(BLIND, paper_compat=compat), make_batch(BLIND)
+    tensors = ("state", "action", "is_pad", "noise")
+    longer = {name: torch.cat([v, v[:1]]) for name in tensors for v in [getattr(batch, name)]}
+    longer["is_pad"][3] = True
+    for name, value in model.loss(replace(batch, **longer)).items():
+        torch.testing.assert_close(value, model.loss(batch)[name])
+
+
+def gradients(model: ActModel, batch: Batch) -> dict[str, torch.Tensor]:
+    model.zero_grad()
+    model.loss(batch)["loss"].backward()
+    return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+
+
+@pytest.mark.parametrize("compat", [False, True])
+@pytest.mark.parametrize("filler", [1e6, float("inf"), float("nan")])
+def test_padded_actions_change_nothing(make_model, make_batch, compat: bool, filler: float):
+    model, batch = make_model(BLIND, paper_compat=compat), make_batch(BLIND)
+    other = replace(batch, action=batch.action.masked_fill(batch.is_pad[..., None], filler))
+    expected, found = gradients(model, batch), gradients(model, other)
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    assert torch.equal(model.loss(batch)["loss"], model.loss(other)["loss"])
+
+
+def test_every_valid_action_changes_the_loss(make_model, make_batch):
+    model, batch = make_model(BLIND), make_batch(BLIND)
+    for b, k in torch.nonzero(~batch.is_pad).tolist():
+        action = batch.action.clone()
+        action[b, k] += 0.5
+        assert not torch.equal(
+            model.loss(replace(batch, action=action))["l1"], model.loss(batch)["l1"]
+        )
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"paper_compat": True}, {"use_cvae": False}, {"pre_norm": True}],
+)
+@pytest.mark.parametrize("cameras", [0, 2])
+def test_what_is_trained_has_a_gradient_and_the_rest_has_none(
+    make_model, make_batch, settings: dict[str, Any], cameras: int
+):
+    sizes = Sizes(5, 3, cameras, (40, 70))
+    model = make_model(sizes, **settings)
+    found = gradients(model, make_batch(sizes, latent=model.noise_size))
+    assert found.keys() == {n for n, p in model.named_parameters() if p.requires_grad}
+    assert all(torch.isfinite(gradient).all() for gradient in found.values())
+
+
+def test_noise_is_what_the_network_asks_for(make_model, make_batch):
+    model, batch = make_model(BLIND), make_batch(BLIND)
+    assert model.noise_size == 4
+    other = replace(batch, noise=batch.noise + 1.0)
+    assert not torch.equal(model.loss(batch)["l1"], model.loss(other)["l1"])
+    assert torch.equal(model.loss(batch)["kl"], model.loss(other)["kl"])
+    plain = make_model(BLIND, use_cvae=False)
+    assert plain.noise_size == 0
+    losses = plain.loss(make_batch(BLIND, latent=0))
+    assert losses["kl"].item() == 0.0
+    assert torch.equal(losses["loss"], losses["l1"])
+
+
+def test_the_prediction_is_that_of_the_latent_0(make_model, make_batch):
+    model, batch = make_model(), make_batch()
+    expected = model._actions(batch.state, batch.images, torch.zeros(3, 4))
+    assert torch.equal(model.predict(batch.state, batch.images), expected)
+    other = model._actions(batch.state, batch.images, torch.ones(3, 4))
+    assert not torch.allclose(other, expected)
+
+
+def test_the_paper_compatible_actions_are_those_of_the_first_layer(make_model, make_batch):
+    model, batch = make_model(paper_compat=True), make_batch()
+    assert len(model.decoder.layers) == 3
+    found = {}
+    model.encoder.register_forward_hook(lambda _m, given, result: found.update(e=(given, result)))
+    actions = model.predict(batch.state, batch.images)
+    (_, places), memory = found["e"]
+    first = model.decoder.layers[0](torch.zeros(3, 6, 16), model.queries, memory, memory + places)
+    assert torch.equal(actions, model.action_head(model.decoder.norm(first)))
+
+
+def test_by_default_every_layer_matters(make_model, make_batch):
+    model, batch = make_model(BLIND), make_batch(BLIND)
+    before = model.predict(batch.state, None)
+    for layer in model.decoder.layers:
+        layer.feed_forward.narrow.weight.data *= -1.0
+        after = model.predict(batch.state, None)
+        assert not torch.allclose(after, before)
+        before = after
+
+
+def test_cameras_are_told_apart(make_model, make_batch):
+    batch = make_batch()
+    swapped = batch.images.flip(1)
+    model = make_model()
+    assert not torch.allclose(
+        model.predict(batch.state, batch.images), model.predict(batch.state, swapped), atol=1e-4
+    )
+    # In the public code they are not: to attention, tokens are a set.
+    compat = make_model(paper_compat=True)
+    torch.testing.assert_close(
+        compat.predict(batch.state, batch.images),
+        compat.predict(batch.state, swapped),
+        atol=1e-5,
+        rtol=1e-5,
+    )
+
+
+def test_the_place_in_the_picture_matters(make_model, make_batch):
+    batch = make_batch()
+    model = make_model(paper_compat=True)
+    assert not torch.allclose(
+        model.predict(batch.state, batch.images),
+        model.predict(batch.state, batch.images.flip(3)),
+        atol=1e-4,
+    )
+
+
+@pytest.mark.parametrize("cameras", [0, 2])
+def test_examples_are_independent(make_model, make_batch, cameras: int):
+    sizes = Sizes(5, 3, cameras, (40, 70))
+    model, batch = make_model(sizes).eval(), make_batch(sizes)
+    together = model.predict(batch.state, batch.images)
+    for b in range(3):
+        images = None if batch.images is None else batch.images[b : b + 1]
+        alone = model.predict(batch.state[b : b + 1], images)
+        # Other sizes of matrices are summed in another order.
+        torch.testing.assert_close(alone[0], together[b], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("image", [(30, 40), (33, 31), (1, 1), (64, 20)])
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_any_image_size_and_number_of_cameras(
+    make_model, make_batch, image: tuple[int, int], cameras: int
+):
+    sizes = Sizes(5, 3, cameras, image)
+    model, batch = make_model(sizes), make_batch(sizes)
+    assert model.predict(batch.state, batch.images).shape == (3, 6, 3)
+    assert torch.isfinite(model.loss(batch)["loss"])
+
+
+@pytest.mark.parametrize("given", [None, (3, 2, 70, 40, 3), (3, 1, 40, 70, 3), (3, 2, 3, 40, 70)])
+def test_images_of_another_shape_are_refused(make_model, make_batch, given):
+    images = None if given is None else torch.zeros(given, dtype=torch.uint8)
+    with pytest.raises(ValueError, match=r"images of \(2, 40, 70, 3\) are needed"):
+        make_model().predict(make_batch().state, images)
+
+
+@pytest.mark.parametrize("cameras", [0, 2])
+def test_a_step_waits_for_no_number(make_model, make_batch, cameras: int):
+    # Tensors of the meta device have shapes and no numbers: reading one, as .item() and choosing
+    # by a mask do, fails there. On a GPU it would halt the queue.
+    sizes = Sizes(5, 3, cameras, (40, 70))
+    model, batch = make_model(sizes).to("meta"), make_batch(sizes)
+    moved = Batch(**{k: None if v is None else v.to("meta") for k, v in vars(batch).items()})
+    losses = model.loss(moved)
+    losses["loss"].backward()
+    assert {name: value.shape for name, value in losses.items()} == {
+        "loss": (),
+        "l1": (),
+        "kl": (),
+    }
+    assert model.predict(moved.state, moved.images).shape == (3, 6, 3)
+
+
+def test_under_autocast_losses_and_actions_are_fp32(make_model, make_batch):
+    model, batch = make_model(), make_batch()
+    exact = model.loss(batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        losses = model.loss(batch)
+        actions = model.predict(batch.state, batch.images)
+    assert {value.dtype for value in losses.values()} | {actions.dtype} == {torch.float32}
+    for name, value in losses.items():
+        # bf16 has 8 bits: 0.4 % a product, some of which adds up over the layers.
+        assert value.item() == pytest.approx(exact[name].item(), rel=0.05)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.bfloat16, 0.05)])
+@pytest.mark.parametrize("cameras", [0, 2])
+def test_the_copy_for_inference_predicts_the_same(
+    make_model, make_batch, dtype: torch.dtype, tolerance: float, cameras: int
+):
+    sizes = Sizes(5, 3, cameras, (40, 70))
+    model, batch = make_model(sizes, dropout=0.1).train(), make_batch(sizes)
+    state = {name: value.clone() for name, value in model.state_dict().items()}
+    copied = model.for_inference(dtype)
+    assert model.training
+    found = copied.predict(batch.state, batch.images)
+    assert found.dtype == torch.float32
+    expected = model.eval().predict(batch.state, batch.images)
+    scale = expected.abs().max().item()
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=tolerance * scale)
+    assert not any(p.requires_grad for p in copied.parameters())
+    assert all(torch.equal(value, model.state_dict()[name]) for name, value in state.items())
+
+
+@pytest.mark.parametrize(("factor", "groups"), [(1.0, 2), (0.1, 2), (0.0, 1)])
+def test_the_backbone_has_its_own_learning_rate(make_model, factor: float, groups: int):
+    model = make_model(backbone_learning_rate_factor=factor)
+    found = model.parameter_groups(1e-4)
+    assert [group["lr"] for group in found] == [1e-4, 1e-4 * factor][:groups]
+    members = [parameter for group in found for parameter in group["params"]]
+    assert {id(p) for p in members} == {id(p) for p in model.parameters() if p.requires_grad}
+    assert len(members) == len({id(p) for p in members})
+    if groups == 2:
+        assert {id(p) for p in found[1]["params"]} == {
+            id(p) for p in model.vision.backbone.parameters()
+        }
+
+
+def test_without_cameras_there_is_one_group(make_model):
+    assert len(make_model(BLIND).parameter_groups(1e-4)) == 1
+
+
+def test_what_is_saved_builds_the_same_network(make_model, make_batch):
+    model, batch = make_model(), make_batch()
+    other = make_model()
+    for parameter in other.parameters():
+        parameter.data.zero_()
+    other.load_state_dict(model.state_dict())
+    assert torch.equal(other.loss(batch)["loss"], model.loss(batch)["loss"])
+    # Saved as they are: the safetensors format takes contiguous tensors only.
+    assert all(value.is_contiguous() for value in model.state_dict().values())
+
+
+@pytest.mark.long
+def test_it_starts_from_given_weights(make_model, tmp_path):
+    path = tmp_path / "resnet18.safetensors"
+    state = ResNet18().state_dict()
+    save_file(state, path)
+    model = make_model(backbone_weights=str(path))
+    loaded = model.vision.backbone.state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in state.items())
+    with pytest.raises(RequestError, match="without cameras"):
+        make_model(BLIND, backbone_weights=str(path))
+
+
+@pytest.mark.long
+def test_it_compiles_in_one_piece(make_model, make_batch):
+    model, batch = make_model(), make_batch()
+    compiled = torch.compile(model.loss, fullgraph=True, backend="eager")
+    losses = compiled(batch)
+    losses["loss"].backward()
+    torch.testing.assert_close(losses, model.loss(batch), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.long
+def test_it_learns_one_batch_by_heart(make_model, make_batch):
+    model, batch = make_model(BLIND), make_batch(BLIND)
+    optimizer = torch.optim.AdamW(model.parameter_groups(3e-3))
+    before = model.loss(batch)["l1"].item()
+    for _ in range(60):
+        optimizer.zero_grad()
+        model.loss(batch)["loss"].backward()
+        optimizer.step()
+    assert model.loss(batch)["l1"].item() < 0.3 * before

@@ -1,0 +1,146 @@
+"""A network as a policy: every row for itself, whatever runs beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.observation.vector import to_vector, vector_names
+from robo_manip_baselines.policy.chunk_policy import ChunkPolicy
+from robo_manip_baselines.policy.interface import PolicyModel
+from robo_manip_baselines.policy.presets import Acting
+
+SPEC = ObservationSpec(obs="current", cameras=("angle", "top"), image_size=(6, 8))
+SIZE = len(vector_names(SPEC))
+ENSEMBLE, FIRST = Acting(), Acting(temporal_ensemble=False, execute=2)
+
+
+class Network(PolicyModel):
+    """Sees all there is to see, and notes the shapes that it is called with."""
+
+    chunk_size = 4
+
+    def __init__(self) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(1)
+        self.weight = nn.Parameter(torch.randn(SIZE, 28, generator=generator))
+        self.convolution = nn.Conv2d(3, 1, 3, bias=False)
+        nn.init.constant_(self.convolution.weight, 0.01)
+        self.rows: list[int] = []
+
+    def predict(self, state: Tensor, images: Tensor | None) -> Tensor:
+        assert images is not None
+        assert images.dtype == torch.uint8
+        assert images.shape[1:] == (2, 6, 8, 3)
+        assert not self.training
+        assert not torch.is_grad_enabled()
+        self.rows.append(len(state))
+        pictures = images.permute(0, 1, 4, 2, 3).float().flatten(0, 1) / 255
+        seen = self.convolution(pictures).mean((1, 2, 3)).view(-1, 2)
+        seen = seen @ torch.tensor([[1.0], [2.0]])
+        return ((state @ self.weight).tanh() + seen).view(-1, 4, 7)
+
+
+def normalization() -> Normalization:
+    rng = np.random.default_rng(0)
+    draw = [rng.uniform(0.5, 2.0, n).astype(np.float32) for n in (SIZE, SIZE, 7, 7)]
+    return Normalization(*draw)
+
+
+def observe(count: int, seed: int = 0) -> dict[str, NDArray[np.generic]]:
+    rng = np.random.default_rng(seed)
+    components = SPEC.components()
+    vectors = {
+        k: rng.normal(size=(count, len(v))).astype(np.float32) for k, v in components.items()
+    }
+    images = {k: rng.integers(0, 256, (count, 6, 8, 3)).astype(np.uint8) for k in SPEC.image_keys()}
+    return {**vectors, **images}
+
+
+def policy(slots: int, acting: Acting = ENSEMBLE, tile: int | None = None) -> ChunkPolicy:
+    return ChunkPolicy(Network(), SPEC, normalization(), acting, slots=slots, tile=tile)
+
+
+def test_the_first_action_is_what_the_network_says_in_units_of_the_joints() -> None:
+    observations = observe(2)
+    given = policy(2).act(observations, np.arange(2))
+    model, scale = Network().eval(), normalization()
+    state = torch.from_numpy(scale.normalized_state(to_vector(SPEC, observations)))
+    images = torch.from_numpy(
+        np.stack([observations["images/angle"], observations["images/top"]], axis=1)
+    )
+    with torch.no_grad():
+        expected = scale.action(model.predict(state, images)[:, 0].numpy())
+    assert given.dtype == np.float32
+    np.testing.assert_allclose(given, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("acting", [ENSEMBLE, FIRST])
+@pytest.mark.parametrize("tile", [None, 1, 4])
+def test_a_row_does_not_depend_on_its_neighbours(acting: Acting, tile: int | None) -> None:
+    """Bit for bit, in another slot, another order and with other rows beside it."""
+    many, alone = policy(7, acting, tile), policy(3, acting, tile)
+    rows = np.array([6, 2, 0, 5, 1])
+    for step in range(5):
+        observations = observe(5, step)
+        together = many.act(observations, rows)
+        single = alone.act({k: v[1:2] for k, v in observations.items()}, np.array([0]))
+        np.testing.assert_array_equal(together[1:2], single)
+
+
+@pytest.mark.parametrize(("tile", "rows"), [(None, [1] * 5), (2, [2, 2, 2]), (8, [8])])
+def test_the_network_always_sees_whole_tiles(tile: int | None, rows: list[int]) -> None:
+    acting = policy(5, tile=tile)
+    acting.act(observe(5), np.arange(5))
+    assert acting._model.rows == rows
+
+
+def test_only_slots_that_look_are_computed() -> None:
+    acting = policy(3, FIRST)
+    both, one = np.array([0, 2]), np.array([2])
+    assert acting.looks(both).all()
+    acting.act(observe(2), both)
+    assert not acting.looks(both).any()
+    images = {k: v * 0 for k, v in observe(2).items() if k.startswith("images/")}
+    stale, fresh = policy(3, FIRST), acting
+    stale.act(observe(2), both)
+    np.testing.assert_array_equal(
+        fresh.act(observe(2, 1), both), stale.act({**observe(2, 1), **images}, both)
+    )
+    assert fresh._model.rows == [1, 1]
+    fresh.reset(one)
+    assert fresh.looks(np.array([0, 2])).tolist() == [True, True]
+
+
+def test_rows_of_a_tile_that_are_not_used_do_not_matter() -> None:
+    """What an earlier tile left in the memory is wiped, so that even its NaNs do no harm."""
+    acting = policy(4, tile=4)
+    acting._state.fill_(torch.nan)
+    acting.act(observe(1), np.array([0]))
+    assert not torch.isnan(acting._state).any()
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    acting = policy(1)
+    with torch.no_grad():
+        acting._model.weight.fill_(torch.nan)
+    with pytest.raises(RequestError, match="not finite"):
+        acting.act(observe(1), np.array([0]))
+
+
+def test_bf16_is_close_and_other_precisions_are_refused() -> None:
+    half = ChunkPolicy(Network(), SPEC, normalization(), ENSEMBLE, slots=1, precision="bf16").act(
+        observe(1), np.array([0])
+    )
+    full = policy(1).act(observe(1), np.array([0]))
+    # bf16 has 8 bits: sums of 18 products of about 1, through tanh, scaled by up to 2.
+    np.testing.assert_allclose(half, full, atol=0.1)
+    assert not np.array_equal(half, full)
+    with pytest.raises(RequestError, match="unknown precision 'fp8'"):
+        ChunkPolicy(Network(), SPEC, normalization(), ENSEMBLE, slots=1, precision="fp8")

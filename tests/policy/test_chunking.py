@@ -1,0 +1,138 @@
+"""From chunks to actions, against five lines of NumPy over the whole table of predictions."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.policy.chunking import (
+    Chunking,
+    ExecuteFirst,
+    TemporalEnsemble,
+    make_chunking,
+)
+from robo_manip_baselines.policy.presets import Acting
+
+ACTION_SIZE = 2
+
+
+def ensemble_oracle(chunks: NDArray[np.float32], decay: float) -> NDArray[np.float64]:
+    """Average over the table (T, T + K, A): row s holds the chunk predicted at step s."""
+    steps, size, _ = chunks.shape
+    table = np.full((steps, steps + size, ACTION_SIZE), np.nan)
+    for s in range(steps):
+        table[s, s : s + size] = chunks[s]
+    columns = [table[~np.isnan(table[:, t, 0]), t] for t in range(steps)]  # oldest first
+    return np.array([np.average(c, 0, np.exp(-decay * np.arange(len(c)))) for c in columns])
+
+
+def first_oracle(chunks: NDArray[np.float32], execute: int) -> NDArray[np.float32]:
+    steps = len(chunks)
+    return np.array([chunks[t - t % execute, t % execute] for t in range(steps)])
+
+
+@dataclasses.dataclass
+class Play:
+    """Episodes played one after another in slots, each slot at a pace of its own."""
+
+    chunking: Chunking
+    actions: dict[int, list[NDArray[np.float32]]] = dataclasses.field(default_factory=dict)
+
+    def step(self, slots: list[int], chunks: NDArray[np.float32]) -> None:
+        numbers = np.array(slots)
+        needed = self.chunking.needs_chunk(numbers)
+        for slot, action in zip(slots, self.chunking.act(numbers, chunks[needed]), strict=True):
+            self.actions.setdefault(slot, []).append(action)
+
+
+@st.composite
+def schedules(draw: st.DrawFn) -> tuple[int, list[list[int]]]:
+    """Number of slots, and for every turn the slots that act, in any order."""
+    slots = draw(st.integers(1, 4))
+    some = st.lists(st.integers(0, slots - 1), unique=True, min_size=1)
+    return slots, draw(st.lists(some, min_size=1, max_size=25))
+
+
+@given(
+    schedule=schedules(),
+    size=st.integers(1, 7),
+    execute=st.integers(0, 7),
+    decay=st.sampled_from([0.01, 0.0, 0.7, -0.3]),
+    reset_at=st.integers(0, 25),
+    seed=st.integers(0, 99),
+)
+def test_every_slot_acts_as_if_it_were_alone(
+    schedule: tuple[int, list[list[int]]],
+    size: int,
+    execute: int,
+    decay: float,
+    reset_at: int,
+    seed: int,
+) -> None:
+    """Execute 0 stands for the ensemble. Slot 0 starts another episode at turn ``reset_at``."""
+    slots, turns = schedule
+    execute = min(execute, size)
+    acting = Acting(temporal_ensemble=execute == 0, decay=decay, execute=max(execute, 1))
+    play = Play(make_chunking(acting, slots, size, ACTION_SIZE))
+    rng = np.random.default_rng(seed)
+    # Zeros among them: a prediction of zero is a prediction.
+    draw = rng.integers(-2, 3, (len(turns), slots, size, ACTION_SIZE)).astype(np.float32)
+    episodes: list[tuple[int, list[NDArray[np.float32]]]] = [(s, []) for s in range(slots)]
+    current = dict(enumerate(range(slots)))
+    expected_of: dict[int, list[int]] = {s: [s] for s in range(slots)}
+    for turn, acts in enumerate(turns):
+        if turn == reset_at:
+            play.chunking.reset(np.array([0]))
+            episodes.append((0, []))
+            current[0] = len(episodes) - 1
+            expected_of[0].append(current[0])
+        for slot in acts:
+            episodes[current[slot]][1].append(draw[turn, slot])
+        play.step(acts, draw[turn, acts])
+    for slot in range(slots):
+        parts = [np.array(episodes[e][1]) for e in expected_of[slot] if episodes[e][1]]
+        if not parts:
+            continue
+        expected = np.concatenate(
+            [first_oracle(p, execute) if execute else ensemble_oracle(p, decay) for p in parts]
+        )
+        # float32 out of float64 sums of at most 7 numbers below 3.
+        np.testing.assert_allclose(play.actions[slot], expected, rtol=0, atol=1e-6)
+
+
+def test_the_ensemble_of_two() -> None:
+    ensemble = TemporalEnsemble(1, 3, 1, decay=0.5)
+    slot = np.array([0])
+    ensemble.act(slot, np.array([[[1.0], [2.0], [3.0]]], np.float32))
+    action = ensemble.act(slot, np.array([[[0.0], [0.0], [0.0]]], np.float32))
+    np.testing.assert_allclose(action, 2.0 / (1.0 + np.exp(-0.5)), rtol=1e-6)
+
+
+def test_the_ensemble_holds_no_table_of_chunks() -> None:
+    ensemble = TemporalEnsemble(8, 100, 7)
+    numbers = sum(v.size for v in vars(ensemble).values() if isinstance(v, np.ndarray))
+    assert numbers <= 8 * 100 * (7 + 1) + 2 * 100
+
+
+def test_a_chunk_is_asked_for_only_when_the_last_is_used_up() -> None:
+    first = ExecuteFirst(2, 5, 1, execute=3)
+    chunks = np.arange(5, dtype=np.float32).reshape(1, 5, 1)
+    needs = []
+    for _ in range(7):
+        slots = np.array([1])
+        needs.append(bool(first.needs_chunk(slots)[0]))
+        first.act(slots, chunks if needs[-1] else chunks[:0])
+    assert needs == [True, False, False, True, False, False, True]
+    assert first.needs_chunk(np.array([0])).all()  # it has never acted
+
+
+@pytest.mark.parametrize("execute", [6, 100])
+def test_no_more_than_a_chunk_can_be_carried_out(execute: int) -> None:
+    with pytest.raises(RequestError, match=f"execute {execute}: must be 1 to 5"):
+        make_chunking(Acting(temporal_ensemble=False, execute=execute), 1, 5, 1)

@@ -1,0 +1,293 @@
+"""Batches: what they hold, and that nothing but seed and step decides it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robo_manip_baselines.data import episode_path, write_episode
+from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
+from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
+from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.policy.interface import Batch
+from robo_manip_baselines.training.frames import FrameSource
+from robo_manip_baselines.training.loader import BatchLoader, part_of
+from robo_manip_baselines.training.schedule import Schedule
+
+LENGTHS = (6, 9, 4, 7, 5)
+TRAIN = (3, 0, 4)  # not in order: the schedule's episodes are places in this list
+CHUNK = 4
+NOISE = 3
+
+cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demonstrations")
+    for seed, steps in enumerate(LENGTHS):
+        images = make_images(steps, cameras=("top", "angle"))
+        path = episode_path(folder, seed, success=True)
+        write_episode(path, make_arrays(steps, seed), images, make_attributes(seed))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def blind(folder: Path) -> Demonstrations:
+    return load_demonstrations(folder, ObservationSpec(obs="current", cameras=()))
+
+
+@pytest.fixture(scope="module")
+def shown(folder: Path) -> Demonstrations:
+    return load_demonstrations(folder, ObservationSpec(cameras=("top",), image_size=(24, 32)))
+
+
+def statistics(loaded: Demonstrations) -> Normalization:
+    rows = loaded.rows(TRAIN)
+    return Normalization.of(loaded.state[rows], loaded.action[rows])
+
+
+def make_loader(loaded: Demonstrations, sampler: str = "frame", **changes: Any) -> BatchLoader:
+    schedule = Schedule(loaded.lengths[list(TRAIN)], sampler, changes.pop("batch_size", 4), 5)
+    options = {"chunk_size": CHUNK, "noise_size": NOISE, "seed": 5, "device": "cpu", **changes}
+    return BatchLoader(loaded, statistics(loaded), TRAIN, schedule, **options)
+
+
+def assert_equal(one: Batch, other: Batch) -> None:
+    for field in fields(Batch):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        assert (a is None) == (b is None)
+        if a is not None:
+            assert a.dtype == b.dtype, field.name
+            assert torch.equal(a.cpu(), b.cpu()), field.name
+
+
+def test_a_batch_holds_what_the_schedule_says(blind: Demonstrations) -> None:
+    loader, scale = make_loader(blind), statistics(blind)
+    schedule = Schedule(blind.lengths[list(TRAIN)], "frame", 4, 5)
+    seen_padding = False
+    for step in range(2 * schedule.steps_per_epoch):
+        batch = loader.batch(step)
+        examples = schedule.batch(step)
+        assert batch.images is None
+        assert batch.noise.shape == (len(examples), NOISE)
+        valid = 0
+        for i, (episode, start) in enumerate(examples):
+            rows = blind.rows([TRAIN[episode]])
+            states, actions = blind.state[rows], blind.action[rows]
+            state = (states[start] - scale.state_mean) / scale.state_std
+            np.testing.assert_array_equal(batch.state[i].numpy(), state, strict=True)
+            for k in range(CHUNK):
+                is_past = start + k >= len(rows)
+                assert bool(batch.is_pad[i, k]) == is_past
+                valid += not is_past
+                if not is_past:
+                    action = (actions[start + k] - scale.action_mean) / scale.action_std
+                    np.testing.assert_array_equal(batch.action[i, k].numpy(), action, strict=True)
+        assert batch.num_valid.dtype == torch.float32
+        assert batch.num_valid.shape == ()
+        assert batch.num_valid.item() == valid
+        seen_padding |= bool(batch.is_pad.any())
+    assert seen_padding
+
+
+@settings(max_examples=20)
+@given(first=st.integers(0, 15), count=st.integers(0, 12), depth=st.integers(0, 6))
+def test_a_step_is_the_same_wherever_one_starts_and_however_far_ahead(
+    blind: Demonstrations, first: int, count: int, depth: int
+) -> None:
+    whole = make_loader(blind, depth=0)
+    batches = list(make_loader(blind, depth=depth).batches(first, first + count))
+    assert len(batches) == count
+    for step, batch in enumerate(batches, first):
+        assert_equal(batch, whole.batch(step))
+
+
+def test_noise_is_normal_and_new_at_every_step(blind: Demonstrations) -> None:
+    loader = make_loader(blind, noise_size=500, batch_size=16)
+    noise = torch.stack([loader.batch(step).noise for step in (0, 2, 4)])
+    # 24 000 numbers: the mean strays by 0.0065, the deviation by 0.0046; five times that.
+    assert abs(noise.mean().item()) < 0.033
+    assert abs(noise.std().item() - 1.0) < 0.023
+    assert len(torch.unique(noise)) > 0.99 * noise.numel()
+    other = make_loader(blind, noise_size=500, batch_size=16, seed=6)
+    assert not torch.equal(other.batch(0).noise, loader.batch(0).noise)
+
+
+@pytest.mark.parametrize("world_size", [1, 2, 3, 5])
+def test_processes_share_a_batch_out(blind: Demonstrations, world_size: int) -> None:
+    whole = make_loader(blind)
+    parts = [make_loader(blind, rank=rank, world_size=world_size) for rank in range(world_size)]
+    for step in range(6):
+        expected = whole.batch(step)
+        got = [loader.batch(step) for loader in parts]
+        # A part without an example is one that is padding altogether.
+        real = [batch for batch in got if not batch.is_pad.all()]
+        for name in ("state", "action", "is_pad", "noise"):
+            joined = torch.cat([getattr(batch, name) for batch in real])
+            assert torch.equal(joined, getattr(expected, name)), name
+        for batch in got:
+            assert len(batch.state) >= 1
+            # One division in float32 at the most.
+            torch.testing.assert_close(batch.num_valid * world_size, expected.num_valid)
+        assert len(got) - len(real) == max(world_size - len(expected.state), 0)
+        sizes = [0 if batch.is_pad.all() else len(batch.state) for batch in got]
+        assert max(sizes) - min(sizes) <= 1
+
+
+def test_parts_are_contiguous() -> None:
+    assert [part_of(10, rank, 4) for rank in range(4)] == [
+        slice(0, 2),
+        slice(2, 5),
+        slice(5, 7),
+        slice(7, 10),
+    ]
+
+
+@pytest.mark.parametrize("budget", [0, None])
+def test_images_are_those_of_the_first_step(shown: Demonstrations, budget: int | None) -> None:
+    schedule = Schedule(shown.lengths[list(TRAIN)], "episode", 2, 5)
+    with FrameSource(shown, memory_budget=budget) as frames:
+        loader = make_loader(shown, "episode", batch_size=2, frames=frames)
+        for step, batch in enumerate(loader.batches(0, 6)):
+            rows = [shown.offsets[TRAIN[e]] + t for e, t in schedule.batch(step)]
+            assert batch.images is not None
+            expected = frames.images(np.array(rows))
+            np.testing.assert_array_equal(batch.images.numpy(), expected, strict=True)
+            channels_first = batch.images[:, 0].permute(0, 3, 1, 2)
+            assert channels_first.is_contiguous(memory_format=torch.channels_last)
+
+
+def loading_threads() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("batches")]
+
+
+@pytest.mark.parametrize("is_exhausted", [True, False])
+def test_threads_end(blind: Demonstrations, is_exhausted: bool) -> None:
+    batches = make_loader(blind).batches(0, 20)
+    assert not loading_threads()
+    next(batches)
+    assert loading_threads()
+    if is_exhausted:
+        assert sum(1 for _ in batches) == 19
+    else:
+        batches.close()
+    assert not loading_threads()
+
+
+def test_threads_end_when_the_consumer_fails(blind: Demonstrations) -> None:
+    def consume(batches: Iterator[Batch]) -> None:
+        for _ in batches:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        consume(make_loader(blind).batches(0, 1000))
+    assert not loading_threads()
+
+
+def test_a_failure_ahead_comes_when_its_batch_is_due(
+    blind: Demonstrations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loader = make_loader(blind, depth=6)
+    schedule_batch = Schedule.batch
+
+    def batch(self: Schedule, step: int) -> np.ndarray:
+        if step == 3:
+            raise OSError("the disk is gone")
+        return schedule_batch(self, step)
+
+    monkeypatch.setattr(Schedule, "batch", batch)
+    batches = loader.batches(0, 9)
+    for _ in range(3):
+        next(batches)
+    with pytest.raises(OSError, match="the disk is gone"):
+        next(batches)
+    assert not loading_threads()
+
+
+def test_no_more_than_depth_batches_are_made_ahead(
+    blind: Demonstrations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    schedule_batch = Schedule.batch
+
+    def batch(self: Schedule, step: int) -> np.ndarray:
+        asked.append(step)
+        return schedule_batch(self, step)
+
+    monkeypatch.setattr(Schedule, "batch", batch)
+    batches = make_loader(blind, depth=2).batches(0, 50)
+    for _ in range(5):
+        next(batches)
+    assert max(asked, default=0) <= 4 + 2
+    batches.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rank": 2, "world_size": 2}, "rank 2 of 2 processes"),
+        ({"rank": -1}, "rank -1 of 1"),
+        ({"depth": -1}, "depth -1: must be 0 or more"),
+    ],
+)
+def test_wrong_arguments(blind: Demonstrations, changes: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_loader(blind, **changes)
+
+
+def test_schedule_and_frames_must_fit(blind: Demonstrations, shown: Demonstrations) -> None:
+    schedule = Schedule([6, 7, 5], "frame", 4, 5)
+    options = {"chunk_size": CHUNK, "noise_size": NOISE, "seed": 5, "device": "cpu"}
+    with pytest.raises(ValueError, match="schedule is of other episodes"):
+        BatchLoader(blind, statistics(blind), TRAIN, schedule, **options)
+    with pytest.raises(ValueError, match="if, and only if, there are cameras"):
+        make_loader(shown)
+    with (
+        FrameSource(shown) as frames,
+        pytest.raises(ValueError, match="if, and only if, there are cameras"),
+    ):
+        make_loader(blind, frames=frames)
+
+
+def copies(loader: BatchLoader, steps: int) -> list[Batch]:
+    """Copies of batches, made on the GPU; late, when their memory might be in use again."""
+    kept = []
+    for step, batch in enumerate(loader.batches(0, steps)):
+        if step % 2:
+            torch.cuda._sleep(5_000_000)  # some milliseconds, on the stream that reads the batch
+        values = {field.name: getattr(batch, field.name) for field in fields(Batch)}
+        kept.append(Batch(**{k: v if v is None else v.clone() for k, v in values.items()}))
+    return kept
+
+
+@cuda
+@pytest.mark.parametrize("budget", [0, None])
+def test_a_gpu_gets_the_same_images(shown: Demonstrations, budget: int | None) -> None:
+    with FrameSource(shown, memory_budget=budget) as frames:
+        here = make_loader(shown, frames=frames, depth=0)
+        there = make_loader(shown, frames=frames, device="cuda")
+        for step, batch in enumerate(copies(there, 60)):
+            assert batch.images is not None
+            assert batch.images.device.type == batch.num_valid.device.type == "cuda"
+            assert_equal(batch, here.batch(step))
+
+
+@cuda
+@pytest.mark.parametrize("depth", [0, 4])
+@pytest.mark.parametrize("noise_size", [0, NOISE])
+def test_a_gpu_gets_the_same_vectors(blind: Demonstrations, depth: int, noise_size: int) -> None:
+    here = make_loader(blind, depth=0, noise_size=noise_size)
+    there = make_loader(blind, depth=depth, device="cuda:0", noise_size=noise_size)
+    for step, batch in enumerate(copies(there, 60)):
+        assert_equal(batch, here.batch(step))

@@ -1,0 +1,198 @@
+"""Options: preset, then file, then command line; every mistake in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.policy.act.config import ActConfig
+from robo_manip_baselines.policy.act.presets import PRESETS
+from robo_manip_baselines.training.options import TrainOptions, parse_options
+
+
+def parse(line: str, *, has_gpu: bool = False) -> TrainOptions[ActConfig]:
+    return parse_options(line.split(), has_gpu)
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "options.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("line", "has_gpu", "preset"),
+    [
+        ("Act", True, "paper"),
+        ("Act", False, "cpu"),
+        ("Act --preset auto", False, "cpu"),
+        ("Act --preset paper", False, "paper"),
+        ("Act --preset=cpu", True, "cpu"),
+        ("Mlp", True, "cpu"),
+    ],
+)
+def test_auto_takes_paper_where_there_is_a_gpu(line: str, has_gpu: bool, preset: str) -> None:
+    assert parse(line, has_gpu=has_gpu).preset == preset
+
+
+@pytest.mark.parametrize("name", ["paper", "cpu"])
+def test_a_preset_gives_every_default(name: str) -> None:
+    options, preset = parse(f"Act --preset {name}"), PRESETS[name]
+    assert options.network == preset.config
+    assert options.training == preset.training
+    assert options.spec.cameras == preset.cameras
+    assert options.spec.image_size == preset.image_size
+    assert options.spec.object_pose == preset.object_pose
+
+
+def test_the_paper_preset_is_table_iii() -> None:
+    options = parse("Act --preset paper")
+    assert (options.network.kl_weight, options.network.chunk_size) == (10.0, 100)
+    assert (options.network.hidden_size, options.network.feedforward_size) == (512, 3200)
+    assert (options.training.batch_size, options.training.learning_rate) == (8, 1e-5)
+    assert (options.training.epochs, options.training.sampler) == (2000, "episode")
+    assert options.spec.cameras == ("top", "angle", "front_close")
+
+
+def test_the_command_line_goes_before_the_file_before_the_preset(tmp_path: Path) -> None:
+    file = write(tmp_path, "chunk_size: 7\nkl_weight: 3\nbatch_size: 5\ncameras: [top, angle]\n")
+    options = parse(f"Act --preset cpu --config {file} --kl_weight 4 --seed 9")
+    assert options.network.chunk_size == 7
+    assert options.network.kl_weight == 4.0
+    assert options.training.batch_size == 5
+    assert options.spec.cameras == ("top", "angle")
+    assert options.network.hidden_size == PRESETS["cpu"].config.hidden_size
+    assert options.seed == 9
+
+
+def test_a_file_may_name_the_preset(tmp_path: Path) -> None:
+    file = write(tmp_path, "preset: paper\n")
+    assert parse(f"Act --config {file}").training.batch_size == 8
+    assert parse(f"Act --config {file} --preset cpu").preset == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("yaml_text", "line", "epochs", "steps"),
+    [
+        ("", "", None, PRESETS["cpu"].training.steps),
+        ("", "--epochs 3", 3, None),
+        ("", "--steps 4", None, 4),
+        ("epochs: 5", "", 5, None),
+        ("epochs: 5", "--steps 4", None, 4),
+        ("steps: 6", "--epochs=3", 3, None),
+        ("steps: 6\nepochs: null", "", None, 6),
+    ],
+)
+def test_one_budget_replaces_the_other(
+    tmp_path: Path, yaml_text: str, line: str, epochs: int | None, steps: int | None
+) -> None:
+    file = write(tmp_path, yaml_text)
+    training = parse(f"Act --preset cpu --config {file} {line}").training
+    assert (training.epochs, training.steps) == (epochs, steps)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Act --preset paper --paper_compat --cameras top --image_size 30x40 --object_pose",
+        "Act --preset cpu --epochs 7 --obs baseline --no_object_pose --dataset a/b --compile",
+        "Mlp --obs current --num_episodes 3 --arms both",
+    ],
+)
+def test_saved_options_read_back_as_they_were(tmp_path: Path, line: str) -> None:
+    options = parse(line)
+    file = write(tmp_path, yaml.safe_dump(options.to_config()))
+    again = parse(f"{options.policy} --config {file}")
+    assert again.to_config() == options.to_config()
+    assert (again.network, again.training, again.spec) == (
+        options.network,
+        options.training,
+        options.spec,
+    )
+
+
+def test_resuming_reads_the_options_of_the_run(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("steps: 77\nchunk_size: 3\n")
+    resumed = parse(f"Act --preset cpu --out {tmp_path} --resume")
+    assert (resumed.training.steps, resumed.network.chunk_size) == (77, 3)
+    assert parse(f"Act --preset cpu --out {tmp_path}").training.steps != 77
+
+
+@pytest.mark.parametrize(
+    ("line", "folder"),
+    [
+        ("Act --preset cpu", "runs/act_current_pred_h2_cpu_seed0"),
+        ("Act --preset cpu --horizon 4 --seed 3", "runs/act_current_pred_h4_cpu_seed3"),
+        ("Mlp --obs current", "runs/mlp_current_cpu_seed0"),
+        ("Act --preset paper --obs baseline --out x/y", "x/y"),
+    ],
+)
+def test_run_folders(line: str, folder: str) -> None:
+    assert parse(line).folder == Path(folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "parts"),
+    [
+        ("", ["say first which policy", "Act, Mlp"]),
+        ("--preset cpu Act", ["say first which policy"]),
+        ("act", ["unknown policy 'act'", "mean 'Act'"]),
+        ("Act --preset papre", ["unknown preset 'papre'", "mean 'paper'", "valid: cpu, paper"]),
+        ("Act --chunk_siez 3", ["'--chunk_siez'", "mean '--chunk_size'"]),
+        ("Mlp --kl_weight 3", ["unknown option '--kl_weight'"]),
+        ("Act --batch_size x", ["--batch_size is a whole number, not 'x'"]),
+        ("Act --epochs x", ["--epochs", "'x'"]),
+        ("Act --epochs 1 --steps 2", ["--epochs or as --steps, one of the two"]),
+        ("Act --steps 0", ["steps 0: must be 1 or more"]),
+        ("Act --chunk_size 0", ["chunk_size 0: must be 1 or more"]),
+        ("Act --obs all", ["unknown observation preset 'all'", "valid: baseline"]),
+        ("Act --horizon 6", ["horizon 6: must be 1 to 5"]),
+        ("Act --cameras left", ["unknown camera 'left'", "top"]),
+        ("Act --image_size big", ["image size 'big'", "480x640"]),
+        ("Act --log_every 0", ["log_every 0: must be 1 or more"]),
+        ("Act --seed -1", ["seed -1: must be 0 or more"]),
+        ("Act --env Feeding", ["unknown environment 'Feeding'", "mean 'FeedingEnv'"]),
+        ("Act --config nowhere.yaml", ["cannot read 'nowhere.yaml'"]),
+    ],
+)
+def test_wrong_command_lines(line: str, parts: list[str]) -> None:
+    with pytest.raises(RequestError) as caught:
+        parse(line)
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("chunk_siez: 3", ["unknown option 'chunk_siez'", "mean 'chunk_size'", "batch_size"]),
+        ("batch_size: many", ["--batch_size is a whole number, not 'many'"]),
+        ("batch_size: {a: 1}", ["batch_size must be one value or a list"]),
+        ("schedule: linear", ["unknown schedule 'linear'; valid: constant, cosine"]),
+        ("- 3", ["must be lines of 'option: value'"]),
+        ("a: [", ["is no YAML"]),
+        ("policy: Mlp", ["is of policy Mlp, not Act"]),
+        ("resume: true", ["unknown option 'resume'"]),
+    ],
+)
+def test_wrong_files_are_named(tmp_path: Path, text: str, parts: list[str]) -> None:
+    file = write(tmp_path, text)
+    with pytest.raises(RequestError) as caught:
+        parse(f"Act --preset cpu --config {file}")
+    for part in [str(file), *parts]:
+        assert part in " ".join(str(caught.value).split())
+
+
+@pytest.mark.parametrize("line", ["--help", "Act --help", "Mlp --preset cpu -h"])
+def test_help_shows_the_policys_own_defaults(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        parse(line)
+    assert not stop.value.code
+    page = capsys.readouterr().out
+    assert "--learning_rate" in page
+    assert ("--kl_weight" in page) == ("Mlp" not in line)

@@ -1,0 +1,126 @@
+"""Which examples a step sees: every one in its turn, at random, and the same ones every time."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.training.schedule import Schedule
+from robo_manip_baselines.training.settings import TrainSettings
+
+LENGTHS = st.lists(st.integers(1, 9), min_size=1, max_size=8)
+
+
+def epoch(schedule: Schedule, number: int) -> np.ndarray:
+    first = number * schedule.steps_per_epoch
+    steps = range(first, first + schedule.steps_per_epoch)
+    return np.concatenate([schedule.batch(step) for step in steps])
+
+
+@given(LENGTHS, st.integers(1, 12), st.integers(0, 99), st.integers(0, 5))
+def test_frame_sampler_visits_every_frame_once(
+    lengths: list[int], batch_size: int, seed: int, number: int
+) -> None:
+    schedule = Schedule(lengths, "frame", batch_size, seed)
+    every = sorted((episode, t) for episode, steps in enumerate(lengths) for t in range(steps))
+    assert sorted(map(tuple, epoch(schedule, number).tolist())) == every
+    assert schedule.frames_per_epoch == len(every)
+
+
+@given(LENGTHS, st.integers(1, 12), st.integers(0, 99), st.integers(0, 5))
+def test_episode_sampler_visits_every_episode_once(
+    lengths: list[int], batch_size: int, seed: int, number: int
+) -> None:
+    schedule = Schedule(lengths, "episode", batch_size, seed)
+    episodes, starts = epoch(schedule, number).T
+    assert sorted(episodes) == list(range(len(lengths)))
+    assert (starts >= 0).all()
+    assert (starts < np.array(lengths)[episodes]).all()
+    assert schedule.frames_per_epoch == len(lengths)
+
+
+@given(LENGTHS, st.sampled_from(["episode", "frame"]), st.integers(1, 12), st.data())
+def test_a_step_is_the_same_whatever_came_before(
+    lengths: list[int], sampler: str, batch_size: int, data: st.DataObject
+) -> None:
+    used = Schedule(lengths, sampler, batch_size, 7)
+    for step in data.draw(st.lists(st.integers(0, 60), min_size=1, max_size=10)):
+        fresh = Schedule(lengths, sampler, batch_size, 7)
+        np.testing.assert_array_equal(used.batch(step), fresh.batch(step), strict=True)
+        assert used.epoch_of(step) == step // used.steps_per_epoch
+
+
+@pytest.mark.parametrize("sampler", ["episode", "frame"])
+def test_only_the_last_batch_of_an_epoch_is_smaller(sampler: str) -> None:
+    schedule = Schedule([4, 3, 3], sampler, 2 if sampler == "episode" else 4, 0)
+    sizes = [len(schedule.batch(step)) for step in range(2 * schedule.steps_per_epoch)]
+    assert sizes == ([2, 1, 2, 1] if sampler == "episode" else [4, 4, 2, 4, 4, 2])
+
+
+@pytest.mark.parametrize("sampler", ["episode", "frame"])
+def test_order_differs_between_epochs_and_seeds(sampler: str) -> None:
+    orders = {
+        epoch(Schedule([30] * 30, sampler, 8, seed), number).tobytes()
+        for seed in range(4)
+        for number in range(4)
+    }
+    assert len(orders) == 16
+
+
+def test_every_start_is_as_likely_as_any_other() -> None:
+    schedule = Schedule([5], "episode", 8, 0)
+    counts = Counter(int(schedule.batch(step)[0, 1]) for step in range(2000))
+    # 400 each; the standard deviation is 18, so 90 is five of them.
+    assert sorted(counts) == [0, 1, 2, 3, 4]
+    assert all(abs(count - 400) < 90 for count in counts.values())
+
+
+def test_table_3() -> None:
+    settings = TrainSettings(batch_size=8, epochs=2000)
+    lengths = [430] * 50
+    held_out = Schedule(lengths[:40], "episode", settings.batch_size, 0)
+    assert (held_out.steps_per_epoch, held_out.frames_per_epoch) == (5, 40)
+    assert held_out.total_steps(settings) == 10_000
+    everything = Schedule(lengths, "episode", settings.batch_size, 0)
+    assert (everything.steps_per_epoch, everything.frames_per_epoch) == (7, 50)
+    assert everything.total_steps(settings) == 14_000
+    assert everything.total_steps(TrainSettings(steps=123)) == 123
+
+
+def test_a_schedule_stays_what_it_was() -> None:
+    # A run that is resumed with a later release must go on with the same examples.
+    assert Schedule([5, 3, 9], "episode", 2, 11).batch(4).tolist() == [[0, 4], [1, 1]]
+    assert Schedule([5, 3, 9], "frame", 3, 11).batch(7).tolist() == [[2, 5], [0, 1], [1, 1]]
+
+
+def test_a_batch_cannot_be_spoilt() -> None:
+    batch = Schedule([5, 3, 9], "frame", 3, 0).batch(0)
+    with pytest.raises(ValueError, match="read-only"):
+        batch[0, 0] = 9
+
+
+@pytest.mark.parametrize(
+    ("lengths", "sampler", "batch_size", "seed", "message"),
+    [
+        ([5], "frames", 8, 0, "unknown sampler 'frames' .*valid: episode, frame"),
+        ([5], "frame", 0, 0, "batch_size 0: must be 1 or more"),
+        ([5], "frame", 8, -1, "seed -1: must be 0 or more"),
+        ([], "frame", 8, 0, "at least one episode"),
+        ([5, 0], "frame", 8, 0, "each of at least one step"),
+    ],
+)
+def test_what_cannot_be_scheduled(
+    lengths: list[int], sampler: str, batch_size: int, seed: int, message: str
+) -> None:
+    with pytest.raises(RequestError, match=message):
+        Schedule(lengths, sampler, batch_size, seed)
+
+
+def test_there_is_no_step_before_the_first() -> None:
+    with pytest.raises(ValueError, match="step -1"):
+        Schedule([5], "frame", 8, 0).batch(-1)

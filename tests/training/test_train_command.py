@@ -1,0 +1,219 @@
+"""``bin/Train.py`` from outside: signals, resuming, several processes, what it says."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
+from robo_manip_baselines.policy.checkpoint_files import list_checkpoints
+from robo_manip_baselines.training.metrics import read_metrics
+from robo_manip_baselines.training.requirements import prepare_pytorch
+from robo_manip_baselines.training.train_command import train
+
+pytestmark = pytest.mark.long
+
+TINY = "--preset cpu --chunk_size 3 --hidden_size 8 --batch_size 4 --log_every 5 --logger none"
+LONG = 1_000_000  # steps that no test waits for
+TIMEOUT = 120.0  # seconds; hangs fail, slow machines do not
+
+
+@pytest.fixture
+def line(episodes: Path, tmp_path: Path) -> str:
+    """A tiny run into ``tmp_path/run``; the policy and the budget come from the test."""
+    return f"{TINY} --dataset {episodes} --out {tmp_path / 'run'}"
+
+
+def start(repository: Path, args: str, *, launcher: tuple[str, ...] = ()) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, *launcher, str(repository / "bin" / "Train.py"), *args.split()],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+def wait_for_step(process: subprocess.Popen[str], run: Path, step: int) -> None:
+    end = time.monotonic() + TIMEOUT
+    while not any(line["step"] >= step for line in read_metrics(run / "metrics.jsonl")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def losses(run: Path) -> list[tuple[str, int, float]]:
+    return [(x["kind"], x["step"], x["loss"]) for x in read_metrics(run / "metrics.jsonl")]
+
+
+def weights(run: Path) -> bytes:
+    return (read_checkpoint(run).folder / "model.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_says_how_to_go_on(
+    number: signal.Signals, line: str, repository: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    process = start(repository, f"Mlp {line} --steps {LONG}")
+    wait_for_step(process, run, 5)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 130
+    assert f"go on with: python bin/Train.py Mlp --out {run} --resume" in errors
+    assert "Traceback" not in errors
+    [(step, _)] = list_checkpoints(run)
+    assert f"stopped at step {step}" in errors
+    assert load_model(read_checkpoint(run))
+
+
+def test_a_killed_run_goes_on_as_if_nothing_had_been(
+    line: str, repository: Path, tmp_path: Path
+) -> None:
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    # Slow enough to be killed on the way: many layers, saved often.
+    args = f"Mlp {line} --dropout 0.3 --ema_decay 0.9 --hidden_layers 9 --checkpoint_every 40"
+    args += " --steps 200 --validate_every 30"
+    process = start(repository, args)
+    wait_for_step(process, run, 60)
+    process.kill()
+    process.communicate()
+    (step, _), *_ = list_checkpoints(run)
+    assert 0 < step < 200, "killed too late"
+    partial = run / "checkpoints" / ".step_00000199.1.partial"
+    partial.mkdir()
+    process = start(repository, f"Mlp --out {run} --resume")
+    output, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 0, errors
+    assert f"--policy Mlp --checkpoint {run}" in output
+    assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")
+    process = start(repository, args.replace(str(run), str(whole)))
+    process.communicate(timeout=TIMEOUT)
+    assert weights(run) == weights(whole)
+    assert losses(run) == losses(whole)
+    assert not partial.exists()
+
+
+def test_two_processes_train_as_one(line: str, repository: Path, tmp_path: Path) -> None:
+    """With the same batches, hence the same losses but for the order of sums."""
+    args = "Mlp {} --steps 20 --learning_rate 0.01 --clip_norm 1 --ema_decay 0.9"
+    train(args.format(line).split())
+    both = str(tmp_path / "both")
+    two = args.format(line).replace(str(tmp_path / "run"), both)
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2")
+    process = start(repository, two, launcher=launcher)
+    output, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 0, errors
+    assert output.count("next: python bin/Rollout.py") == 1  # one process speaks
+    assert errors.count("budget:") == 1
+    one, other = losses(tmp_path / "run"), losses(Path(both))
+    assert [x[:2] for x in other] == [x[:2] for x in one]
+    # float32 sums in another order, through 20 steps of AdamW
+    assert [x[2] for x in other] == pytest.approx([x[2] for x in one], rel=1e-4)
+    # The checkpoint is that of any run: one process goes on where two were.
+    assert train(f"Mlp --out {both} --resume".split()) == 0
+
+
+def test_two_processes_resume(line: str, repository: Path, tmp_path: Path) -> None:
+    args = f"Mlp {line} --steps {LONG} --dropout 0.2"
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2")
+    steps = []
+    for extra in ("", " --resume"):
+        process = start(repository, args + extra, launcher=launcher)
+        wait_for_step(process, tmp_path / "run", 5 + (steps[-1] if steps else 0))
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=TIMEOUT)
+        steps.append(read_checkpoint(tmp_path / "run").step)
+        assert f"stopped at step {steps[-1]}" in errors
+    assert steps[0] < steps[1]
+    written = [x[1] for x in losses(tmp_path / "run") if x[0] == "train"]
+    assert written == list(range(5, written[-1] + 1, 5))
+
+
+def test_what_a_run_folder_holds_is_respected(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    args = f"Mlp {line} --steps 6"
+    assert train(args.split()) == 0
+    for name in ("config.yaml", "metrics.jsonl", "curves.png", "checkpoints/step_00000006"):
+        assert (run / name).exists(), name
+    with pytest.raises(RequestError, match="holds this run, finished; choose another --out"):
+        train(args.split())
+    with pytest.raises(RequestError, match="with dropout 0.0, not 0.1"):
+        train(f"{args} --dropout 0.1 --resume".split())
+    capsys.readouterr()
+    before = weights(run)
+    assert train(f"{args} --resume --device cpu".split()) == 0
+    assert f"--policy Mlp --checkpoint {run}" in capsys.readouterr().out
+    assert weights(run) == before
+
+
+def test_an_unfinished_run_needs_resume(line: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    train(f"Mlp {line} --steps 4 --checkpoint_every 2".split())
+    newest = list_checkpoints(run)[-1][1]
+    for path in newest.iterdir():
+        path.unlink()
+    newest.rmdir()
+    with pytest.raises(RequestError, match="at step 2; --resume continues it"):
+        train(f"Mlp {line} --steps 4 --checkpoint_every 2".split())
+    assert train(f"Mlp --out {run} --resume".split()) == 0
+    assert read_checkpoint(run).step == 4
+
+
+def test_other_demonstrations_are_not_resumed(line: str, episodes: Path, tmp_path: Path) -> None:
+    train(f"Mlp {line} --steps 2 --num_episodes 6".split())
+    fewer = tmp_path / "fewer"
+    fewer.mkdir()
+    for path in sorted(episodes.iterdir())[:5]:
+        (fewer / path.name).symlink_to(path)
+    more = f"--resume --dataset {fewer} --config {tmp_path / 'c.yaml'}"
+    text = (tmp_path / "run" / "config.yaml").read_text()
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(RequestError, match="holds 5 episodes, not 6"):
+        train(f"Mlp --out {tmp_path / 'run'} {more}".split())
+    train(f"Mlp {TINY} --dataset {episodes} --out {tmp_path / 'all'} --steps 2".split())
+    with pytest.raises(RequestError, match="are not the ones that .* was trained on"):
+        train(f"Mlp --out {tmp_path / 'all'} --resume --dataset {fewer}".split())
+
+
+def test_missing_demonstrations_name_the_command(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match=r"python bin/Rollout\.py FeedingEnv --scripted"):
+        train(f"Act --preset cpu --dataset {tmp_path / 'no'} --out {tmp_path / 'run'}".split())
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [("tpu", "must be auto, cpu, cuda"), ("cuda:99", "device 'cuda:99'")],
+)
+def test_devices_that_are_not_there(device: str, message: str, line: str) -> None:
+    with pytest.raises(RequestError, match=message):
+        train(f"Mlp {line} --device {device}".split())
+
+
+def test_missing_packages_name_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    prepare_pytorch()
+    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
+    monkeypatch.setattr("robo_manip_baselines.training.requirements.find_spec", lambda name: None)
+    with pytest.raises(RequestError, match="training needs torch, .*: pip install torch"):
+        prepare_pytorch()
+
+
+def test_tensorboard_has_the_scalars(line: str, tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    train(f"Mlp {line} --steps 10 --logger tensorboard".split())
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    events.Reload()
+    assert [x.step for x in events.Scalars("train/loss")] == [5, 10]
+    assert [x.step for x in events.Scalars("validation/loss")] == [10]
