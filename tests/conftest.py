@@ -13,6 +13,10 @@ import pytest
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")
 
+# pytest-xdist starts a process for each core: threads of torch on top of that only wait for each
+# other, and small networks in tests get a hundred times slower.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from robo_manip_baselines.opengl_check import opengl_problem
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -47,8 +47,8 @@ def evaluate(options: RolloutOptions) -> None:
     logger.info("%s", evaluation)
     if known := evaluation.seen_seeds():
         logger.warning(
-            "%d of the seeds are those of demonstrations, %d among them: how well the policy does "
-            "there says little; choose another --seed",
+            "%d of the seeds are also seeds of the demonstrations (the first is %d); how well the "
+            "policy does there says little: choose another --seed",
             len(known),
             known[0],
         )

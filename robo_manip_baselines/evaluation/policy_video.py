@@ -70,11 +70,12 @@ def write_video(path: Path, task: Task, result: EpisodeResult, recording: Record
         RequestError: there is no OpenGL.
         RuntimeError: the episode, acted out again, ends otherwise than recorded.
     """
-    frames = -(-len(recording.actions) // FRAME_STEPS)
+    last = len(recording.actions) - 1
+    frames = last // FRAME_STEPS + 1 + (last % FRAME_STEPS > 0)
     frame = None
     with VideoWriter(path, 1.0 / (FRAME_STEPS * CONTROL_PERIOD)) as video:
         drawn = video_frames(task, result, recording)
-        for frame in tqdm(drawn, total=frames, unit="frame", desc=path.name):
+        for frame in tqdm(drawn, total=frames, unit="frame", desc=path.name, mininterval=1.0):
             video.write(frame)
         if frame is not None:
             for _ in range(round(HOLD_SECONDS / (FRAME_STEPS * CONTROL_PERIOD))):

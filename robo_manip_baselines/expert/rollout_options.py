@@ -48,13 +48,13 @@ class PolicyOptions:
     video: int = 0
     """Videos to write: of the first successes and the first failures, half of each."""
     obs: str | None = None
-    """What the policy is shown; only checked, the checkpoint says it."""
+    """What the policy is shown: the checkpoint says it, this is only checked against it."""
     horizon: int | None = None
-    """Likewise, the frames that it looks ahead."""
+    """Frames that it looks ahead; only checked."""
     error: str | None = None
-    """Likewise, what stands between the true and the observed mouth."""
+    """What stands between the true and the observed mouth; only checked."""
     object_pose: bool = False
-    """Likewise, that it is shown where the cube is."""
+    """Whether it is shown where the cube is; only checked."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ from robo_manip_baselines.training.run_folder import CONFIG, read_config
 from robo_manip_baselines.training.settings import TrainSettings
 
 Network = TypeVar("Network")
+
+logger = logging.getLogger(__name__)
 
 EXAMPLE = "python bin/Train.py Act --obs current_pred --horizon 2 --seed 0"
 
@@ -183,6 +186,12 @@ def _defaults(policy: str, name: str, preset: PolicyPreset) -> TrainOptions[Any]
 def _choose_preset(name: str, presets: Mapping[str, PolicyPreset], has_gpu: bool) -> str:
     if name == "auto":
         name = "paper" if has_gpu and "paper" in presets else "cpu"
+        logger.info(
+            "--preset auto: %s, so %s%s",
+            "PyTorch finds a GPU" if has_gpu else "PyTorch finds no GPU",
+            name,
+            "" if "paper" in presets else f" (of {', '.join(presets)})",
+        )
     return require_choice("preset", name, presets)
 
 

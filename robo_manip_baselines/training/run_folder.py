@@ -14,7 +14,7 @@ import yaml
 
 from robo_manip_baselines.data.files import atomic_file, prepare_folder
 from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.checkpoint_files import list_checkpoints, remove_partial
+from robo_manip_baselines.policy.checkpoint_files import list_checkpoints
 
 CONFIG = "config.yaml"
 METRICS = "metrics.jsonl"
@@ -100,7 +100,6 @@ def prune(run: Path) -> None:
 
 def start_anew(run: Path) -> None:
     """Remove what a run left that had saved no checkpoint."""
-    remove_partial(run)
     (run / METRICS).unlink(missing_ok=True)
     shutil.rmtree(run / "tensorboard", ignore_errors=True)
 

@@ -14,7 +14,7 @@ import torch
 from robo_manip_baselines.command import EXIT_INTERRUPTED
 from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.policy.checkpoint import Checkpoint, read_checkpoint
-from robo_manip_baselines.policy.checkpoint_files import list_checkpoints
+from robo_manip_baselines.policy.checkpoint_files import list_checkpoints, remove_partial
 from robo_manip_baselines.training.device import choose_device, describe_device, prepare_device
 from robo_manip_baselines.training.distributed import Processes
 from robo_manip_baselines.training.interrupt import StopRequest
@@ -152,6 +152,7 @@ def _finish(options: TrainOptions[Any]) -> None:
 def _open_log(options: TrainOptions[Any], start: Checkpoint | None) -> MetricsLog:
     """Prepare the run folder and open what is written on the way."""
     run = options.folder
+    remove_partial(run)
     if start is None:
         start_anew(run)
         write_config(run, options.to_config())

@@ -214,7 +214,7 @@ def test_seeds_of_demonstrations_are_pointed_out(
     run_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     evaluate(options(run_folder, "--seed 2", out=tmp_path))
-    assert "1 of the seeds are those of demonstrations, 2 among them" in caplog.text
+    assert "1 of the seeds are also seeds of the demonstrations (the first is 2)" in caplog.text
 
 
 def test_the_checkpoint_says_how_to_act_unless_told_otherwise() -> None:

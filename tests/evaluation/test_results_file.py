@@ -116,6 +116,8 @@ def test_a_killed_run_goes_on(tmp_path: Path, cut: int) -> None:
     with open_file(tmp_path) as file:
         assert file.done == {1003: MISS}
         file.append(HIT)
+        # Whole at every moment, for it may be killed again.
+        assert (tmp_path / RESULTS).read_text() == f"{MISS.to_line()}\n{HIT.to_line()}\n"
         file.append(NEVER)
     assert read_results(tmp_path) == [NEVER, HIT, MISS]
 

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
+from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.envs.mujoco.feeding_success import MOUTH_TOLERANCE
 from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.evaluation.env_workers import WorkerEnvironments, open_environments
@@ -24,6 +26,7 @@ from robo_manip_baselines.evaluation.task import Task
 from robo_manip_baselines.expert.demonstrate import demonstrate
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model
 from robo_manip_baselines.policy.chunk_policy import ChunkPolicy
+from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import Acting
 
 pytestmark = pytest.mark.long
@@ -232,3 +235,35 @@ def test_numbers_that_make_no_sense_are_refused(task: Task) -> None:
 def test_no_seeds_no_episodes(task: Task) -> None:
     with open_environments(task, 2, 0) as environments:
         assert rollout(Recurrent(2), environments, []) == []
+
+
+class Seeing(PolicyModel):
+    """Every pixel and every number of the state makes a difference to its actions."""
+
+    chunk_size = 4
+
+    def predict(self, state: torch.Tensor, images: torch.Tensor | None) -> torch.Tensor:
+        assert images is not None
+        seen = images.float().flatten(1) / 255
+        weight = torch.linspace(-1, 1, seen.shape[1])
+        glance = (seen * weight).mean(1) + 0.01 * state.sum(1)
+        return glance[:, None, None] * torch.linspace(-1, 1, 28).view(4, 7)
+
+
+@pytest.mark.gl
+def test_a_network_that_sees_acts_the_same_in_any_arrangement(task: Task) -> None:
+    """Images through shared memory; some steps without any."""
+    spec = replace(task.spec, cameras=("front_close", "top"), image_size=(32, 40))
+    seen = replace(task, spec=spec, env_kwargs={"max_episode_steps": 7})
+    ones, zeros = np.ones(seen.vector_size, np.float32), np.zeros(seen.vector_size, np.float32)
+    scale = Normalization(zeros, ones, zeros[:7], ones[:7])
+    played = []
+    for acting in (Acting(), FIRST):
+        for num_envs, workers in ((1, 0), (3, 2)):
+            policy = ChunkPolicy(Seeing(), spec, scale, acting, slots=num_envs)
+            with open_environments(seen, num_envs, workers) as environments:
+                _, recordings = play(policy, environments, SEEDS)
+            played.append(np.array([recordings[seed].actions for seed in SEEDS]))
+    np.testing.assert_array_equal(played[0], played[1])
+    np.testing.assert_array_equal(played[2], played[3])
+    assert not np.array_equal(played[0], played[2])

@@ -43,7 +43,7 @@ class Network(PolicyModel):
         self.rows.append(len(state))
         pictures = images.permute(0, 1, 4, 2, 3).float().flatten(0, 1) / 255
         seen = self.convolution(pictures).mean((1, 2, 3)).view(-1, 2)
-        seen = seen @ torch.tensor([[1.0], [2.0]])
+        seen = seen @ torch.tensor([[1.0], [2.0]], device=seen.device)
         return ((state @ self.weight).tanh() + seen).view(-1, 4, 7)
 
 
@@ -63,8 +63,21 @@ def observe(count: int, seed: int = 0) -> dict[str, NDArray[np.generic]]:
     return {**vectors, **images}
 
 
-def policy(slots: int, acting: Acting = ENSEMBLE, tile: int | None = None) -> ChunkPolicy:
-    return ChunkPolicy(Network(), SPEC, normalization(), acting, slots=slots, tile=tile)
+def policy(
+    slots: int, acting: Acting = ENSEMBLE, tile: int | None = None, device: str = "cpu"
+) -> ChunkPolicy:
+    return ChunkPolicy(
+        Network(), SPEC, normalization(), acting, slots=slots, tile=tile, device=device
+    )
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_acts_as_a_cpu_does() -> None:
+    for step in range(3):
+        on_cpu, on_gpu = (policy(5, device=device) for device in ("cpu", "cuda"))
+        observations = observe(5, step)
+        given = [one.act(observations, np.arange(5)) for one in (on_cpu, on_gpu)]
+        np.testing.assert_allclose(given[0], given[1], atol=5e-3)  # TF32 convolution
 
 
 def test_the_first_action_is_what_the_network_says_in_units_of_the_joints() -> None:
@@ -81,11 +94,19 @@ def test_the_first_action_is_what_the_network_says_in_units_of_the_joints() -> N
     np.testing.assert_allclose(given, expected, rtol=1e-5, atol=1e-6)
 
 
+CUDA = pytest.param(
+    "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+)
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
 @pytest.mark.parametrize("acting", [ENSEMBLE, FIRST])
 @pytest.mark.parametrize("tile", [None, 1, 4])
-def test_a_row_does_not_depend_on_its_neighbours(acting: Acting, tile: int | None) -> None:
+def test_a_row_does_not_depend_on_its_neighbours(
+    acting: Acting, tile: int | None, device: str
+) -> None:
     """Bit for bit, in another slot, another order and with other rows beside it."""
-    many, alone = policy(7, acting, tile), policy(3, acting, tile)
+    many, alone = policy(7, acting, tile, device), policy(3, acting, tile, device)
     rows = np.array([6, 2, 0, 5, 1])
     for step in range(5):
         observations = observe(5, step)

@@ -114,6 +114,22 @@ def test_the_ensemble_of_two() -> None:
     np.testing.assert_allclose(action, 2.0 / (1.0 + np.exp(-0.5)), rtol=1e-6)
 
 
+def test_an_episode_knows_nothing_of_the_last_one_in_its_slot() -> None:
+    rng = np.random.default_rng(0)
+    chunks = rng.normal(size=(2, 5, 4, ACTION_SIZE)).astype(np.float32)
+    for acting in (Acting(decay=0.5), Acting(temporal_ensemble=False, execute=3)):
+        used, fresh = (make_chunking(acting, 2, 4, ACTION_SIZE) for _ in range(2))
+        slot = np.array([1])
+        for chunk in chunks[0]:
+            used.act(slot, chunk[None][used.needs_chunk(slot)])
+        used.reset(slot)
+        for chunk in chunks[1]:
+            np.testing.assert_array_equal(
+                used.act(slot, chunk[None][used.needs_chunk(slot)]),
+                fresh.act(slot, chunk[None][fresh.needs_chunk(slot)]),
+            )
+
+
 def test_the_ensemble_holds_no_table_of_chunks() -> None:
     ensemble = TemporalEnsemble(8, 100, 7)
     numbers = sum(v.size for v in vars(ensemble).values() if isinstance(v, np.ndarray))

@@ -38,6 +38,14 @@ def test_auto_takes_paper_where_there_is_a_gpu(line: str, has_gpu: bool, preset:
     assert parse(line, has_gpu=has_gpu).preset == preset
 
 
+def test_what_auto_took_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    parse("Act --preset cpu")
+    assert caplog.messages == []
+    parse("Act --obs current_pred")
+    assert caplog.messages == ["--preset auto: PyTorch finds no GPU, so cpu"]
+
+
 @pytest.mark.parametrize("name", ["paper", "cpu"])
 def test_a_preset_gives_every_default(name: str) -> None:
     options, preset = parse(f"Act --preset {name}"), PRESETS[name]

@@ -54,11 +54,10 @@ def test_two_newest_checkpoints_are_kept(tmp_path: Path) -> None:
 
 
 def test_starting_anew_removes_what_a_killed_run_left(tmp_path: Path) -> None:
-    partial = tmp_path / "checkpoints" / ".step_00000005.123.partial"
-    partial.mkdir(parents=True)
+    (tmp_path / "tensorboard").mkdir()
     (tmp_path / "metrics.jsonl").write_text("{}\n")
     start_anew(tmp_path)
-    assert not partial.exists()
+    assert not (tmp_path / "tensorboard").exists()
     assert not (tmp_path / "metrics.jsonl").exists()
 
 

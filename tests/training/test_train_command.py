@@ -147,7 +147,7 @@ def test_what_a_run_folder_holds_is_respected(
         assert (run / name).exists(), name
     with pytest.raises(RequestError, match="holds this run, finished; choose another --out"):
         train(args.split())
-    with pytest.raises(RequestError, match="with dropout 0.0, not 0.1"):
+    with pytest.raises(RequestError, match=r"with dropout 0\.0, not 0\.1"):
         train(f"{args} --dropout 0.1 --resume".split())
     capsys.readouterr()
     before = weights(run)
@@ -181,7 +181,7 @@ def test_other_demonstrations_are_not_resumed(line: str, episodes: Path, tmp_pat
     with pytest.raises(RequestError, match="holds 5 episodes, not 6"):
         train(f"Mlp --out {tmp_path / 'run'} {more}".split())
     train(f"Mlp {TINY} --dataset {episodes} --out {tmp_path / 'all'} --steps 2".split())
-    with pytest.raises(RequestError, match="are not the ones that .* was trained on"):
+    with pytest.raises(RequestError, match=r"are not the ones that .* was trained on"):
         train(f"Mlp --out {tmp_path / 'all'} --resume --dataset {fewer}".split())
 
 
@@ -205,7 +205,7 @@ def test_missing_packages_name_the_command(monkeypatch: pytest.MonkeyPatch) -> N
     prepare_pytorch()
     assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
     monkeypatch.setattr("robo_manip_baselines.training.requirements.find_spec", lambda name: None)
-    with pytest.raises(RequestError, match="training needs torch, .*: pip install torch"):
+    with pytest.raises(RequestError, match=r"training needs torch, .*: pip install torch"):
         prepare_pytorch()
 
 

@@ -173,6 +173,45 @@ def test_the_average_is_what_is_saved_and_validated(episodes: Path, tmp_path: Pa
     assert last["loss"] == pytest.approx(losses["loss"], rel=1e-6)  # seven digits are written
 
 
+def test_every_step_enters_the_average(episodes: Path, tmp_path: Path) -> None:
+    args = f"{MLP} --ema_decay 0.3 --steps 8 --dataset {episodes} --out {tmp_path}"
+    job = Job.of(parse_options(args.split(), has_gpu=False))
+    with assembled(job, None, CPU, Processes()) as parts:
+        train_step = parts.train_step
+        expected = [p.detach().double() for p in train_step.model.parameters()]
+        for step in range(8):
+            train_step(parts.loader.batch(step), step)
+            decay = min(0.3, (1 + step) / (10 + step))
+            expected = [
+                decay * mean + (1 - decay) * now.detach().double()
+                for mean, now in zip(expected, train_step.model.parameters(), strict=True)
+            ]
+        for mean, value in zip(expected, train_step.result.parameters(), strict=True):
+            # eight float32 roundings of weights below 1
+            np.testing.assert_allclose(value.double(), mean, rtol=1e-5, atol=1e-7)
+
+
+def test_validation_is_without_dropout(episodes: Path, tmp_path: Path) -> None:
+    args = f"{MLP} --steps 1 --dataset {episodes} --out {tmp_path}"
+    job = Job.of(parse_options(args.split(), has_gpu=False))
+    with assembled(job, None, CPU, Processes()) as parts:
+        assert parts.validation is not None
+        model = parts.train_step.model.train()
+        losses = parts.validation(model)
+        assert model.training
+        assert parts.validation(model.eval()) == losses
+
+
+def test_every_step_drops_other_units(episodes: Path, tmp_path: Path) -> None:
+    args = f"{MLP} --learning_rate 1e-20 --steps 5 --dataset {episodes} --out {tmp_path}"
+    job = Job.of(parse_options(args.split(), has_gpu=False))
+    with assembled(job, None, CPU, Processes()) as parts:
+        batch = parts.loader.batch(0)
+        losses = [parts.train_step(batch, step)["loss"].item() for step in (0, 1, 2, 0)]
+    assert len(set(losses)) == 3
+    assert losses[0] == losses[3]
+
+
 def test_a_loss_that_is_not_finite_stops_in_one_line(episodes: Path, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match=r"not finite any more at step 3; lower --learning_rate"):
         run(f"{MLP} --learning_rate 1e30", episodes, tmp_path)

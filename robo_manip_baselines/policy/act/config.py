@@ -31,6 +31,9 @@ class ActConfig:
         encoder_layers: of the Transformer over latent, state and image features (public ACT: 4).
         decoder_layers: of the Transformer over the K queries (public ACT: 7, of which it reads
             the first; see ``paper_compat``).
+        state_layers: hidden layers, as wide as ``feedforward_size``, of the perceptron that makes
+            the token of the state (public ACT: 0, one linear layer). Without pictures that token
+            is all there is to see, and one linear layer is not enough: see ``docs/act.md``.
         latent_size: Z, numbers of the latent style variable (public ACT: 32).
         cvae_layers: of the Transformer over class token, state and actions that proposes the
             latent in training (public ACT: 4).
@@ -59,6 +62,7 @@ class ActConfig:
     num_heads: int = 8
     encoder_layers: int = 4
     decoder_layers: int = 7
+    state_layers: int = 0
     latent_size: int = 32
     cvae_layers: int = 4
     use_cvae: bool = True
@@ -73,6 +77,8 @@ class ActConfig:
         for name in _COUNTS:
             if getattr(self, name) < 1:
                 raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
+        if self.state_layers < 0:
+            raise RequestError(f"state_layers {self.state_layers}: must be 0 or more")
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")

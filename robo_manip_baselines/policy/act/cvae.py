@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.positions import sine_positions
-from robo_manip_baselines.policy.act.transformer import Encoder, Linear
+from robo_manip_baselines.policy.act.transformer import Encoder, ExactLinear
 from robo_manip_baselines.policy.interface import Sizes
 
 
@@ -24,10 +24,10 @@ class CvaeEncoder(nn.Module):
         super().__init__()
         width = config.hidden_size
         self.class_token = nn.Parameter(torch.randn(1, width))
-        self.state_projection = Linear(sizes.state, width)
-        self.action_projection = Linear(sizes.action, width)
+        self.state_projection = ExactLinear(sizes.state, width)
+        self.action_projection = ExactLinear(sizes.action, width)
         self.encoder = Encoder(config, config.cvae_layers)
-        self.latent_projection = Linear(width, 2 * config.latent_size)
+        self.latent_projection = ExactLinear(width, 2 * config.latent_size)
         self.register_buffer(
             "positions", sine_positions(2 + config.chunk_size, width), persistent=False
         )
@@ -44,14 +44,14 @@ class CvaeEncoder(nn.Module):
         tokens = torch.cat(
             [
                 self.class_token.expand(batch, 1, -1),
-                self.state_projection(state).float()[:, None],
-                self.action_projection(action).float(),
+                self.state_projection(state)[:, None],
+                self.action_projection(action),
             ],
             dim=1,
         )
         keep = torch.cat([is_pad.new_ones((batch, 2)), ~is_pad], dim=1)
         encoded = self.encoder(tokens, self.positions, keep)
-        mean, log_variance = self.latent_projection(encoded[:, 0]).float().chunk(2, dim=-1)
+        mean, log_variance = self.latent_projection(encoded[:, 0]).chunk(2, dim=-1)
         return mean, log_variance
 
 

@@ -21,7 +21,7 @@ from robo_manip_baselines.policy.act.backbone_weights import load_backbone
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.cvae import CvaeEncoder, kl_divergence
 from robo_manip_baselines.policy.act.positions import sine_positions_2d
-from robo_manip_baselines.policy.act.transformer import Decoder, Encoder, Linear
+from robo_manip_baselines.policy.act.transformer import Decoder, Encoder, ExactLinear, Linear
 from robo_manip_baselines.policy.interface import Batch, PolicyModel, Sizes, masked_mean
 
 
@@ -46,8 +46,8 @@ class ActModel(PolicyModel):
         self.chunk_size = config.chunk_size
         self.noise_size = config.latent_size if config.use_cvae else 0
         self.cvae = CvaeEncoder(config, sizes) if config.use_cvae else None
-        self.latent_projection = Linear(config.latent_size, width)
-        self.state_projection = Linear(sizes.state, width)
+        self.latent_projection = ExactLinear(config.latent_size, width)
+        self.state_projection = _state_projection(config, sizes)
         # Learned positions of latent and state, of unit variance like those of the sines.
         self.token_positions = nn.Parameter(torch.randn(2, width))
         self.vision = Vision(config, sizes) if sizes.cameras else None
@@ -56,7 +56,7 @@ class ActModel(PolicyModel):
         self.decoder = Decoder(
             config, config.decoder_layers, 1 if config.paper_compat else config.decoder_layers
         )
-        self.action_head = Linear(width, sizes.action)
+        self.action_head = ExactLinear(width, sizes.action)
         if config.backbone_weights is not None:
             load_backbone(self.vision and self.vision.backbone, config.backbone_weights)
 
@@ -93,13 +93,13 @@ class ActModel(PolicyModel):
 
         Args:
             dtype: of the matrix products: ``torch.float32`` or ``torch.bfloat16``; the layer
-                norms and what ``predict`` returns are float32 in any case.
+                norms and the layers at both ends are float32 in any case.
         """
         model = copy.deepcopy(self).eval().requires_grad_(False)
         if model.vision is not None:
             fold_for_inference(model.vision.backbone)
         for module in model.modules():
-            if isinstance(module, nn.Linear | nn.Conv2d):
+            if isinstance(module, Linear | nn.Conv2d):
                 module.to(dtype)
         return model.requires_grad_(False)
 
@@ -120,8 +120,8 @@ class ActModel(PolicyModel):
         if latent is None:
             latent = state.new_zeros((state.shape[0], self.config.latent_size))
         tokens = [
-            self.latent_projection(latent).float()[:, None],
-            self.state_projection(state).float()[:, None],
+            self.latent_projection(latent)[:, None],
+            self.state_projection(state)[:, None],
         ]
         positions: list[Tensor] = [self.token_positions]
         if self.vision is not None:
@@ -130,7 +130,19 @@ class ActModel(PolicyModel):
             positions.append(places)
         position_MD = torch.cat(positions)
         memory_BMD = self.encoder(torch.cat(tokens, dim=1), position_MD)
-        return self.action_head(self.decoder(self.queries, memory_BMD, position_MD)).float()
+        return self.action_head(self.decoder(self.queries, memory_BMD, position_MD))
+
+
+def _state_projection(config: ActConfig, sizes: Sizes) -> nn.Module:
+    """From the state (B, S) to its token (B, D)."""
+    layers: list[nn.Module] = []
+    size = sizes.state
+    for _ in range(config.state_layers):
+        wide = config.feedforward_size
+        layers += [ExactLinear(size, wide), nn.LayerNorm(wide), nn.GELU()]
+        size = wide
+    last = ExactLinear(size, config.hidden_size)
+    return nn.Sequential(*layers, last) if layers else last
 
 
 class Vision(nn.Module):

@@ -26,6 +26,18 @@ class Linear(nn.Linear):
         return nn.functional.linear(input, self.weight, self.bias)
 
 
+class ExactLinear(nn.Linear):
+    """A linear layer in fp32 also under autocast: at the ends, where numbers are positions.
+
+    bf16 keeps 8 bits: of a joint that moves by a radian, steps of several milliradians.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Return (..., out_features), fp32."""
+        with torch.autocast(input.device.type, enabled=False):
+            return nn.functional.linear(input.float(), self.weight, self.bias)
+
+
 class Attention(nn.Module):
     """Multi-head attention that never holds its weights in memory."""
 
