@@ -39,7 +39,7 @@ STANDOFF = np.array([0.20, 0.0, 0.0])
 """m from where the mouth is to where the approach starts, level and straight in front of it."""
 
 INSERTION = np.array([0.028, 0.0, 0.0])
-"""m from the mouth to the gripper when it lets go: inside the 0.03 m of Algorithm 1, so that whoever
+"""m from the mouth to the gripper when it lets go: inside the 0.03 m of Algorithm 1, so that who
 learns from it is shown a place where the condition holds, not its edge. The cube's centre is then
 between the lips, 2 mm behind the mouth's centre, and the finger tips are 10 mm before it, at the
 front of the lips."""

@@ -16,6 +16,8 @@ def vector_names(spec: ObservationSpec) -> list[str]:
     return [name for names in spec.components().values() for name in names]
 
 
-def to_vector(spec: ObservationSpec, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+def to_vector(
+    spec: ObservationSpec, observation: Mapping[str, NDArray[Any]]
+) -> NDArray[np.float32]:
     """Join the vectors (..., n) of an observation to one of (..., S); images are left out."""
     return np.concatenate([observation[key] for key in spec.components()], axis=-1)

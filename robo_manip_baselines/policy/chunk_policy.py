@@ -42,7 +42,7 @@ class ChunkPolicy:
         acting: how chunks become actions.
         slots: n.
         device: where the network runs.
-        precision: ``fp32``, or ``bf16`` for autocast.
+        precision: ``fp32``, or ``bf16`` for the products inside the network.
         tile: R; 1 on a CPU and ``CUDA_TILE`` elsewhere if None.
 
     Raises:
@@ -62,8 +62,10 @@ class ChunkPolicy:
         tile: int | None = None,
     ) -> None:
         self._device = torch.device(device)
-        self._is_bf16 = require_choice("precision", precision, PRECISIONS) == "bf16"
-        self._model = model.to(self._device).eval()
+        is_bf16 = require_choice("precision", precision, PRECISIONS) == "bf16"
+        fast = model.eval().for_inference(torch.bfloat16 if is_bf16 else torch.float32)
+        self._is_autocast = is_bf16 and fast is model
+        self._model = fast.to(self._device)
         if spec.cameras:
             self._model = self._model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._spec, self._normalization = spec, normalization
@@ -125,7 +127,7 @@ class ChunkPolicy:
                 self._images.numpy()[:count, camera] = view[rows]
             images = self._images.to(self._device, non_blocking=True)
         inputs = self._state.to(self._device, non_blocking=True)
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._is_bf16):
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._is_autocast):
             chunks = self._model.predict(inputs, images)
         # Waits for the GPU, so that the pinned memory is free for the next tile.
         return chunks[:count].float().cpu().numpy()

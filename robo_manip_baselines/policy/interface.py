@@ -30,8 +30,7 @@ class Batch:
             of processes that share the batch: a process that divides its sum by this number gets
             gradients whose average over the processes is the gradient of the whole batch's mean.
         num_examples: () float32, examples of the whole batch divided by the number of processes,
-            to be used likewise by what is averaged over examples. An example whose steps are all
-            padding is none: it stands in where a process would have nothing.
+            to be used likewise by what is averaged over examples.
     """
 
     state: Tensor
@@ -61,8 +60,17 @@ class PolicyModel(nn.Module):
         raise NotImplementedError
 
     def predict(self, state: Tensor, images: Tensor | None) -> Tensor:
-        """Return normalised actions (B, K, A) float32 for a (B, S) state and (B, N, H, W, 3) images."""
+        """Return normalised actions (B, K, A) float32 for states (B, S), images (B, N, H, W, 3)."""
         raise NotImplementedError
+
+    def for_inference(self, dtype: torch.dtype) -> PolicyModel:
+        """Return a network that only predicts; this one, unless a policy knows a faster form.
+
+        Args:
+            dtype: of the matrix products, ``torch.float32`` or ``torch.bfloat16``; who overrides
+                this needs no autocast.
+        """
+        return self
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, object]]:
         """Return the optimiser's parameter groups; one for all unless a policy overrides it."""
@@ -71,6 +79,6 @@ class PolicyModel(nn.Module):
 
 
 def masked_mean(error: Tensor, is_pad: Tensor, num_valid: Tensor) -> Tensor:
-    """Average (B, K, A) errors over valid steps and elements: padding is in neither sum nor count."""
+    """Average (B, K, A) errors over valid steps: padding is in neither sum nor count."""
     kept = torch.where(is_pad[..., None], 0.0, error)
     return kept.sum() / (num_valid * error.shape[-1])

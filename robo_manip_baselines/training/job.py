@@ -83,9 +83,7 @@ class Job:
     @property
     def total_frames(self) -> int:
         """Examples of the whole budget."""
-        epochs, steps = divmod(self.total_steps, self.schedule.steps_per_epoch)
-        frames = self.schedule.frames_per_epoch
-        return epochs * frames + min(steps * self.schedule.batch_size, frames)
+        return self.total_steps * self.schedule.batch_size
 
     def make_model(self, is_start: bool) -> PolicyModel:
         """Build the network; the seed decides its random weights.

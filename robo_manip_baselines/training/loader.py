@@ -17,6 +17,7 @@ from torch import Tensor
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.policy.interface import Batch
 from robo_manip_baselines.training.chunks import chunk_rows
 from robo_manip_baselines.training.frames import FrameSource
@@ -53,9 +54,7 @@ class BatchLoader:
     memory. Both happen on a stream of their own. Because the threads use the device, a CUDA graph
     that is captured meanwhile needs ``capture_error_mode="thread_local"``.
 
-    Each process takes a contiguous part of every batch, as equal as can be. A process whose part
-    is empty, at the small end of an epoch, takes the first example with all steps marked as
-    padding, which adds nothing to a loss over valid steps.
+    Each process takes a contiguous part of every batch, as equal as can be.
 
     Args:
         demonstrations: all episodes.
@@ -73,6 +72,7 @@ class BatchLoader:
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
     Raises:
+        RequestError: more processes than examples in a batch.
         ValueError: arguments that do not fit one another.
     """
 
@@ -99,6 +99,10 @@ class BatchLoader:
             raise ValueError("frames must be given if, and only if, there are cameras")
         if not 0 <= rank < world_size:
             raise ValueError(f"rank {rank} of {world_size} processes")
+        if world_size > schedule.batch_size:
+            raise RequestError(
+                f"batch_size {schedule.batch_size}: must be at least the {world_size} processes"
+            )
         if depth < 0:
             raise ValueError(f"depth {depth}: must be 0 or more")
         self._schedule = schedule
@@ -158,8 +162,6 @@ class BatchLoader:
             state_noise *= self._state_noise
         part = part_of(count, self._rank, self._world_size)
         num_valid = float((~is_pad).sum()) / self._world_size
-        if part.start == part.stop:
-            part, is_pad = slice(0, 1), np.ones_like(is_pad)
         return self._tables.gather(
             Examples(
                 rows=rows[part],

@@ -25,7 +25,7 @@ def prepare_pytorch() -> None:
     missing = [name for module, name in PACKAGES.items() if find_spec(module) is None]
     if missing:
         raise RequestError(
-            f"training needs {', '.join(missing)}: pip install {' '.join(PACKAGES.values())} "
-            "tensorboard (for a machine without a GPU add "
+            f"policies need {', '.join(missing)}: pip install 'robo_manip_baselines[train]' "
+            "(for a machine without a GPU add "
             "--extra-index-url https://download.pytorch.org/whl/cpu)"
         )

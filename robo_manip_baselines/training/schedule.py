@@ -20,18 +20,14 @@ class Schedule:
 
     With the sampler ``episode`` (the paper's) an epoch draws one start from each episode, uniform
     over its steps; with ``frame`` an epoch visits every step of every episode once. Either way
-    the order is random and another in each epoch, and the last batch of an epoch may be smaller.
-
-    Table III of the paper (batch 8, 2000 epochs) means 100 000 examples of 50 episodes, or 12 500
-    full batches. Here an epoch of 50 is six batches of 8 and one of 2, so that it is 14 000 steps.
-    With a fifth held out, as in the public ACT code, an epoch is 40 episodes in 5 batches: 80 000
-    examples in 10 000 steps.
+    the order is random and another in each epoch. Epochs follow one another without a seam: every
+    batch is full, and one may hold the end of an epoch and the beginning of the next. So 2000
+    epochs of 50 episodes in batches of 8 (paper, Table III) are 12 500 steps.
 
     Attributes:
         lengths: (E,) int64, steps of each training episode.
         sampler, batch_size, seed: as given.
         frames_per_epoch: examples of an epoch.
-        steps_per_epoch: batches of an epoch.
 
     Raises:
         RequestError: unknown sampler, batch size below 1, a negative seed, or no episodes.
@@ -52,19 +48,18 @@ class Schedule:
             raise RequestError("training needs at least one episode, each of at least one step")
         by_episode = sampler == "episode"
         self.frames_per_epoch = len(self.lengths) if by_episode else int(self.lengths.sum())
-        self.steps_per_epoch = -(-self.frames_per_epoch // batch_size)
-        self._plan: tuple[int, NDArray[np.int64]] | None = None
+        self._plans: dict[int, NDArray[np.int64]] = {}
 
-    def epoch_of(self, step: int) -> int:
-        """Return the epoch, from 0 on, that a step (from 0 on) belongs to."""
-        return step // self.steps_per_epoch
+    def epochs(self, steps: int) -> float:
+        """Return how many epochs so many steps are."""
+        return steps * self.batch_size / self.frames_per_epoch
 
     def total_steps(self, settings: TrainSettings) -> int:
-        """Return the budget in optimiser steps, however it was given."""
+        """Return the budget in optimiser steps, however it was given; the last batch is full."""
         if settings.steps is not None:
             return settings.steps
         assert settings.epochs is not None  # TrainSettings takes exactly one of the two
-        return settings.epochs * self.steps_per_epoch
+        return -(-settings.epochs * self.frames_per_epoch // self.batch_size)
 
     def batch(self, step: int) -> NDArray[np.int64]:
         """Return the examples of a step, (b, 2): index of the training episode, first step in it.
@@ -74,15 +69,16 @@ class Schedule:
         """
         if step < 0:
             raise ValueError(f"step {step}: must be 0 or more")
-        epoch, place = divmod(step, self.steps_per_epoch)
-        plan = self._epoch(epoch)
-        return plan[place * self.batch_size : (place + 1) * self.batch_size]
+        numbers = np.arange(step * self.batch_size, (step + 1) * self.batch_size)
+        epochs, places = np.divmod(numbers, self.frames_per_epoch)
+        parts = [self._epoch(int(e))[places[epochs == e]] for e in np.unique(epochs)]
+        return np.concatenate(parts)
 
     def _epoch(self, epoch: int) -> NDArray[np.int64]:
-        """Return all examples of an epoch in their order; the last one asked for is kept."""
-        kept = self._plan  # read once: another thread may be replacing it
-        if kept is not None and kept[0] == epoch:
-            return kept[1]
+        """Return all examples of an epoch in their order; a few are kept."""
+        kept = self._plans.get(epoch)
+        if kept is not None:
+            return kept
         rng = np.random.default_rng(derive_seed(self.seed, "schedule", epoch))
         if self.sampler == "episode":
             episodes = rng.permutation(len(self.lengths))
@@ -93,6 +89,7 @@ class Schedule:
             episodes = np.searchsorted(first, frames, side="right") - 1
             starts = frames - first[episodes]
         plan = np.stack([episodes, starts], axis=1).astype(np.int64, copy=False)
-        plan.setflags(write=False)
-        self._plan = (epoch, plan)
+        # Replaced, not changed: another thread may be reading it. Two, for batches on a seam.
+        self._plans = {number: self._plans[number] for number in list(self._plans)[-1:]}
+        self._plans[epoch] = plan
         return plan

@@ -170,7 +170,7 @@ def _announce(job: Job, parts: Parts, processes: Processes) -> None:
         "preset": f"{options.preset}, seed {options.seed}",
         "run folder": str(options.folder),
         "episodes": f"{len(job.split.train)} to train on, {len(job.split.validation)} held out",
-        "budget": f"{job.total_steps / schedule.steps_per_epoch:.4g} epochs x "
+        "budget": f"{schedule.epochs(job.total_steps):.4g} epochs x "
         f"{schedule.frames_per_epoch} {'starts' if by_episode else 'frames'} = {job.total_steps} "
         f"steps of {options.training.batch_size} = {job.total_frames} frames",
         "device": describe_device(parts.train_step.device)

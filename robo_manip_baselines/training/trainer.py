@@ -78,7 +78,7 @@ class Trainer:
         self._seconds_before = parts.progress.seconds
         self._checkpoint = job.checkpoint()
         self._total_steps = job.total_steps
-        self._steps_per_epoch = job.schedule.steps_per_epoch
+        self._schedule = job.schedule
         self._run = options.folder
         self._log_every = options.log_every
         self._validate_every = options.validate_every
@@ -105,7 +105,7 @@ class Trainer:
             disable=True if not self._processes.is_main else None,
         )
         batches = self._loader.batches(self._step, self._total_steps)
-        with bar, contextlib.closing(batches):  # pyright: ignore[reportArgumentType]
+        with bar, contextlib.closing(batches):
             self._train_step.clock.skip()
             for batch in batches:
                 self._mean.add(self._train_step(batch, self._step))
@@ -157,7 +157,7 @@ class Trainer:
 
     def _write(self, kind: str, values: Mapping[str, float]) -> None:
         if self._log:
-            epoch = self._step / self._steps_per_epoch
+            epoch = self._schedule.epochs(self._step)
             self._log.write(kind, self._step, {"epoch": epoch, **values})
 
     def _say_progress(self, bar: tqdm) -> None:

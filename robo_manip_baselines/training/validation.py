@@ -57,7 +57,7 @@ class Validation:
             device=device,
             frames=frames,
         )
-        self._steps = STARTS * schedule.steps_per_epoch
+        self._steps = -(-STARTS * len(episodes) // batch_size)
         self._device = device
         self._autocast = autocast
 
@@ -72,7 +72,7 @@ class Validation:
         on = self._autocast is not None
         with (
             torch.autocast(self._device.type, self._autocast, enabled=on),
-            contextlib.closing(self._loader.batches(0, self._steps)) as batches,  # pyright: ignore[reportArgumentType]
+            contextlib.closing(self._loader.batches(0, self._steps)) as batches,
         ):
             for batch in batches:
                 parts = model.loss(batch)

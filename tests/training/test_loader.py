@@ -18,6 +18,7 @@ from robo_manip_baselines.data import episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.interface import Batch
 from robo_manip_baselines.training.frames import FrameSource
@@ -76,7 +77,7 @@ def test_a_batch_holds_what_the_schedule_says(blind: Demonstrations) -> None:
     loader, scale = make_loader(blind), statistics(blind)
     schedule = Schedule(blind.lengths[list(TRAIN)], "frame", 4, 5)
     seen_padding = False
-    for step in range(2 * schedule.steps_per_epoch):
+    for step in range(2 * schedule.frames_per_epoch // 4 + 1):
         batch = loader.batch(step)
         examples = schedule.batch(step)
         assert batch.images is None
@@ -124,25 +125,44 @@ def test_noise_is_normal_and_new_at_every_step(blind: Demonstrations) -> None:
     assert not torch.equal(other.batch(0).noise, loader.batch(0).noise)
 
 
-@pytest.mark.parametrize("world_size", [1, 2, 3, 5])
+@pytest.mark.parametrize("world_size", [1, 2, 3, 4])
 def test_processes_share_a_batch_out(blind: Demonstrations, world_size: int) -> None:
-    whole = make_loader(blind)
-    parts = [make_loader(blind, rank=rank, world_size=world_size) for rank in range(world_size)]
+    noise = {"state_noise": 0.3}
+    whole = make_loader(blind, **noise)
+    parts = [
+        make_loader(blind, rank=rank, world_size=world_size, **noise) for rank in range(world_size)
+    ]
     for step in range(6):
         expected = whole.batch(step)
         got = [loader.batch(step) for loader in parts]
-        # A part without an example is one that is padding altogether.
-        real = [batch for batch in got if not batch.is_pad.all()]
         for name in ("state", "action", "is_pad", "noise"):
-            joined = torch.cat([getattr(batch, name) for batch in real])
+            joined = torch.cat([getattr(batch, name) for batch in got])
             assert torch.equal(joined, getattr(expected, name)), name
         for batch in got:
-            assert len(batch.state) >= 1
             # One division in float32 at the most.
             torch.testing.assert_close(batch.num_valid * world_size, expected.num_valid)
-        assert len(got) - len(real) == max(world_size - len(expected.state), 0)
-        sizes = [0 if batch.is_pad.all() else len(batch.state) for batch in got]
+            torch.testing.assert_close(batch.num_examples * world_size, torch.tensor(4.0))
+        sizes = [len(batch.state) for batch in got]
         assert max(sizes) - min(sizes) <= 1
+
+
+def test_more_processes_than_examples_are_refused(blind: Demonstrations) -> None:
+    with pytest.raises(RequestError, match="batch_size 4: must be at least the 5 processes"):
+        make_loader(blind, rank=4, world_size=5)
+
+
+def test_state_noise_is_on_what_the_robot_feels_of_itself_only(blind: Demonstrations) -> None:
+    clean = make_loader(blind, batch_size=16)
+    noisy = make_loader(blind, batch_size=16, state_noise=0.3)
+    steps = range(0, 100, 5)
+    added = torch.stack([noisy.batch(i).state - clean.batch(i).state for i in steps])
+    robot = len(blind.spec.components()["state"])
+    assert 0 < robot < added.shape[-1]
+    assert (added[..., robot:] == 0).all()
+    # 20 x 16 x 14 numbers: the deviation strays by 1 % of itself; five times that.
+    assert abs(added[..., :robot].std().item() - 0.3) < 0.015
+    assert len(torch.unique(added[..., :robot])) > 0.9 * added[..., :robot].numel()
+    assert_equal(noisy.batch(3), make_loader(blind, batch_size=16, state_noise=0.3).batch(3))
 
 
 def test_parts_are_contiguous() -> None:

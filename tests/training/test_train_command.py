@@ -205,7 +205,7 @@ def test_missing_packages_name_the_command(monkeypatch: pytest.MonkeyPatch) -> N
     prepare_pytorch()
     assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
     monkeypatch.setattr("robo_manip_baselines.training.requirements.find_spec", lambda name: None)
-    with pytest.raises(RequestError, match=r"training needs torch, .*: pip install torch"):
+    with pytest.raises(RequestError, match=r"policies need torch, .*: pip install .*\[train\]"):
         prepare_pytorch()
 
 

@@ -69,9 +69,7 @@ class ActModel(PolicyModel):
         if self.cvae is not None:
             mean, log_variance = self.cvae(batch.state, action, batch.is_pad)
             latent = mean + (0.5 * log_variance).exp() * batch.noise
-            # An example that is all padding stands in for none.
-            each = kl_divergence(mean, log_variance).masked_fill(batch.is_pad.all(dim=1), 0.0)
-            kl = each.sum() / batch.num_examples
+            kl = kl_divergence(mean, log_variance).sum() / batch.num_examples
         actions = self._actions(batch.state, batch.images, latent)
         error = nn.functional.l1_loss(actions, action, reduction="none")
         if self.config.paper_compat:

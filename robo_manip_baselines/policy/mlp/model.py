@@ -5,7 +5,8 @@ Legend: B batch, S elements of the state, K actions of a chunk, A elements of an
 
 from __future__ import annotations
 
-import torch.nn.functional as F
+import itertools
+
 from torch import Tensor, nn
 
 from robo_manip_baselines.errors import RequestError
@@ -23,9 +24,12 @@ class MlpModel(PolicyModel):
         self.chunk_size = config.chunk_size
         widths = [sizes.state, *[config.hidden_size] * config.hidden_layers]
         layers: list[nn.Module] = []
-        for wide, narrow in zip(widths[:-1], widths[1:], strict=True):
+        for wide, narrow in itertools.pairwise(widths):
             layers += [nn.Linear(wide, narrow), nn.LayerNorm(narrow), nn.GELU()]
-        layers += [nn.Dropout(config.dropout), nn.Linear(widths[-1], self.chunk_size * sizes.action)]
+        layers += [
+            nn.Dropout(config.dropout),
+            nn.Linear(widths[-1], self.chunk_size * sizes.action),
+        ]
         self.layers = nn.Sequential(*layers)
 
     def predict(self, state: Tensor, images: Tensor | None) -> Tensor:
@@ -34,6 +38,8 @@ class MlpModel(PolicyModel):
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the mean absolute error over valid steps as ``loss`` and ``l1``."""
-        error = F.l1_loss(self.predict(batch.state, batch.images), batch.action, reduction="none")
+        error = nn.functional.l1_loss(
+            self.predict(batch.state, batch.images), batch.action, reduction="none"
+        )
         l1 = masked_mean(error, batch.is_pad, batch.num_valid)
         return {"loss": l1, "l1": l1}

@@ -86,16 +86,6 @@ def test_processes_that_share_a_batch_average_to_the_whole(make_model, make_batc
         torch.testing.assert_close(mean, gradient, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("compat", [False, True])
-def test_an_example_that_is_all_padding_is_none(make_model, make_batch, compat: bool):
-    model, batch = make_model(BLIND, paper_compat=compat), make_batch(BLIND)
-    tensors = ("state", "action", "is_pad", "noise")
-    longer = {name: torch.cat([v, v[:1]]) for name in tensors for v in [getattr(batch, name)]}
-    longer["is_pad"][3] = True
-    for name, value in model.loss(replace(batch, **longer)).items():
-        torch.testing.assert_close(value, model.loss(batch)[name])
-
-
 def gradients(model: ActModel, batch: Batch) -> dict[str, torch.Tensor]:
     model.zero_grad()
     model.loss(batch)["loss"].backward()
