@@ -13,7 +13,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.normalization import Normalization
@@ -29,7 +28,7 @@ from robo_manip_baselines.training.gather import (
     received,
 )
 from robo_manip_baselines.training.schedule import Schedule
-from robo_manip_baselines.training.seeds import derive_seed
+from robo_manip_baselines.training.state_noise import StateNoise, noise_of
 
 WORKERS = 2
 """Batches made at a time: while the last images of one are decoded, the next has begun."""
@@ -38,12 +37,6 @@ WORKERS = 2
 def part_of(count: int, rank: int, world_size: int) -> slice:
     """Return which of ``count`` examples are a process's: contiguous, as equal as can be."""
     return slice(count * rank // world_size, count * (rank + 1) // world_size)
-
-
-def noise_of(seed: int, stream: str, step: int, count: int, size: int) -> Tensor:
-    """Return (count, size) standard normal numbers, a function of seed, stream and step."""
-    generator = torch.Generator().manual_seed(derive_seed(seed, stream, step))
-    return torch.randn(count, size, generator=generator)
 
 
 class BatchLoader:
@@ -67,7 +60,7 @@ class BatchLoader:
         device: where batches go.
         rank: number of this process, from 0 on.
         world_size: processes that share each batch.
-        state_noise: see ``TrainSettings``.
+        state_noise: what is added to states; nothing if None.
         frames: where images come from; None without cameras. Not closed by the loader.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
@@ -89,7 +82,7 @@ class BatchLoader:
         device: torch.device | str,
         rank: int = 0,
         world_size: int = 1,
-        state_noise: float = 0.0,
+        state_noise: StateNoise | None = None,
         frames: FrameSource | None = None,
         depth: int = 4,
     ) -> None:
@@ -110,9 +103,7 @@ class BatchLoader:
         self._chunk_size = chunk_size
         self._noise_size = noise_size
         self._seed = seed
-        # What the robot feels of itself comes first; the mouth and the cube are shown as they are.
-        self._state_noise = torch.zeros(demonstrations.state.shape[1])
-        self._state_noise[: len(demonstrations.spec.components()["state"])] = state_noise
+        self._state_noise = state_noise or StateNoise(demonstrations.spec)
         self._rank, self._world_size = rank, world_size
         self._depth = depth
         rows = demonstrations.rows(episodes)
@@ -156,10 +147,7 @@ class BatchLoader:
         episodes, starts = examples.T
         rows, is_pad = chunk_rows(self._offsets, episodes, starts, self._chunk_size)
         noise = noise_of(self._seed, "noise", step, count, self._noise_size)
-        state_noise: Tensor | None = None
-        if self._state_noise[0]:
-            state_noise = noise_of(self._seed, "state", step, count, len(self._state_noise))
-            state_noise *= self._state_noise
+        state_noise = self._state_noise.draw(self._seed, step, count)
         part = part_of(count, self._rank, self._world_size)
         num_valid = float((~is_pad).sum()) / self._world_size
         return self._tables.gather(

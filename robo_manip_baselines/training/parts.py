@@ -19,6 +19,7 @@ from robo_manip_baselines.training.frames import FrameSource, free_memory
 from robo_manip_baselines.training.job import Job
 from robo_manip_baselines.training.loader import BatchLoader
 from robo_manip_baselines.training.metrics import RunningMean
+from robo_manip_baselines.training.state_noise import StateNoise
 from robo_manip_baselines.training.step import TrainStep
 from robo_manip_baselines.training.trainer_state import Progress, restore
 from robo_manip_baselines.training.validation import Validation
@@ -82,7 +83,7 @@ def assembled(
             job.schedule,
             chunk_size=model.chunk_size,
             noise_size=model.noise_size,
-            state_noise=settings.state_noise,
+            state_noise=StateNoise.of(job.demonstrations.spec, settings),
             seed=seed,
             device=device,
             rank=processes.rank,

@@ -30,6 +30,9 @@ class TrainSettings:
             the robot feels of itself (joints, gripper), in units of each element's own; 0 for
             none. Scripted demonstrations never leave their path: without noise a policy learns to
             read the next target off the last one, and is lost where no demonstration has been.
+        clock_noise: likewise for the time since the start that ``current_pred`` shows, the same
+            for all its frames. With a clock to go by, a policy lets go by the clock, whether or
+            not it has reached the mouth.
         validation_fraction: share of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
@@ -50,6 +53,7 @@ class TrainSettings:
     epochs: int | None = None
     steps: int | None = None
     state_noise: float = 0.0
+    clock_noise: float = 0.0
     validation_fraction: float = 0.2
     ema_decay: float = 0.0
     precision: str = "auto"
@@ -67,7 +71,7 @@ class TrainSettings:
                 raise RequestError(f"{name} {value}: must be 1 or more")
         if not self.learning_rate > 0.0:
             raise RequestError(f"learning_rate {self.learning_rate}: must be more than 0")
-        for name in ("weight_decay", "warmup_steps", "clip_norm", "state_noise"):
+        for name in ("weight_decay", "warmup_steps", "clip_norm", "state_noise", "clock_noise"):
             if getattr(self, name) < 0:
                 raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more")
         for name in ("validation_fraction", "ema_decay"):
