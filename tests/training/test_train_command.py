@@ -201,9 +201,9 @@ def test_devices_that_are_not_there(device: str, message: str, line: str) -> Non
 
 
 def test_missing_packages_name_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     prepare_pytorch()
-    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
+    assert os.environ["GOMP_SPINCOUNT"] == "7"
     monkeypatch.setattr("robo_manip_baselines.training.requirements.find_spec", lambda name: None)
     with pytest.raises(RequestError, match=r"policies need torch, .*: pip install .*\[train\]"):
         prepare_pytorch()

@@ -9,7 +9,13 @@ from robo_manip_baselines.training.settings import TrainSettings
 PRESETS = {
     "paper": PolicyPreset(
         config=ActConfig(),
-        training=TrainSettings(batch_size=8, learning_rate=1e-5, sampler="episode", epochs=2000),
+        training=TrainSettings(
+            batch_size=8,
+            learning_rate=1e-5,
+            sampler="episode",
+            epochs=2000,
+            validation_fraction=0.0,  # the paper trains on all 50
+        ),
         acting=Acting(temporal_ensemble=True, decay=0.01),
     ),
     "cpu": PolicyPreset(

@@ -1,0 +1,29 @@
+"""The presets are what the docs say they are."""
+
+from __future__ import annotations
+
+from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.policy.act.presets import PRESETS
+from robo_manip_baselines.training.schedule import Schedule
+
+
+def test_paper_is_table_3() -> None:
+    preset = PRESETS["paper"]
+    config, training = preset.config, preset.training
+    assert config.kl_weight == 10.0
+    assert config.chunk_size == 100
+    assert config.hidden_size == 512
+    assert config.feedforward_size == 3200
+    assert training.batch_size == 8
+    assert training.learning_rate == 1e-5
+    assert training.epochs == 2000
+    assert training.sampler == "episode"
+    assert (preset.cameras, preset.image_size, preset.object_pose) == (CAMERAS, (480, 640), False)
+    schedule = Schedule([430] * 50, training.sampler, training.batch_size, 0)
+    assert schedule.total_steps(training) == 12_500
+
+
+def test_cpu_sees_no_images() -> None:
+    preset = PRESETS["cpu"]
+    assert preset.cameras == ()
+    assert preset.object_pose
