@@ -11,21 +11,24 @@ from robo_manip_baselines.evaluation.episode_watch import EpisodeWatch
 from robo_manip_baselines.evaluation.failure import FAILURES, failure_kind
 from robo_manip_baselines.evaluation.result import Offset
 
-BELOW = float(np.nextafter(0.03, 0.0))  # m, just within the tolerance along x
+BELOW = float(np.nextafter(0.06, 0.0))  # m, just at the face
 
 
 @pytest.mark.parametrize(
     ("offset", "released", "kind"),
     [
         (None, False, "never_grasped"),
-        # Not at the mouth's depth: what counts is whether the cube was still there.
+        # Not at the face, or in front of the mouth: what counts is whether the cube was still there.
         ((0.15, 0.0, 0.0), True, "dropped"),
         ((0.15, 0.0, 0.0), False, "too_late"),
         ((0.03, 0.0, 0.0), True, "dropped"),
         ((0.03, 0.0, 0.0), False, "too_late"),
         ((-0.03, 0.0, 0.0), False, "too_late"),
-        ((0.031, 0.2, -0.3), False, "too_late"),
-        # At its depth: the larger part across the face; letting go beside the mouth is a miss.
+        ((0.06, 0.2, -0.3), False, "too_late"),
+        ((-0.06, 0.2, -0.3), True, "dropped"),
+        ((BELOW, 0.009, -0.009), True, "dropped"),
+        ((BELOW, 0.009, -0.009), False, "too_late"),
+        # At the face and beside the mouth: the larger part across the face; letting go beside the mouth is a miss.
         ((BELOW, 0.0, 0.012), False, "missed_high"),
         ((BELOW, 0.0, 0.012), True, "missed_high"),
         ((-BELOW, 0.0, -0.012), True, "missed_low"),
@@ -47,7 +50,7 @@ def test_boundaries(offset: Offset | None, released: bool, kind: str) -> None:
 
 
 def test_every_combination_of_facts_has_a_known_kind_and_every_kind_occurs() -> None:
-    steps = (-0.2, -0.03, -0.01, 0.0, 0.009, 0.01, 0.029, 0.03, 0.2)
+    steps = (-0.2, -0.06, -0.03, -0.01, 0.0, 0.009, 0.01, 0.029, 0.03, 0.2)
     offsets: list[Offset | None] = [None, *itertools.product(steps, repeat=3)]
     kinds = {
         failure_kind(is_success=False, was_released=released, closest_offset=offset)
