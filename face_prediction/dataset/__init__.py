@@ -1,0 +1,1 @@
+"""Face tracks and their videos to sequences that predictors learn from, and back."""

@@ -1,0 +1,16 @@
+"""Forecasts of face landmarks that need no training on images: the baselines."""
+
+from __future__ import annotations
+
+from face_prediction.forecast.interface import Forecaster, Sequences
+from face_prediction.forecast.mouth import mouth_centre
+from face_prediction.forecast.registry import FORECASTERS, fit_forecaster, restore_forecaster
+
+__all__ = [
+    "FORECASTERS",
+    "Forecaster",
+    "Sequences",
+    "fit_forecaster",
+    "mouth_centre",
+    "restore_forecaster",
+]

@@ -1,0 +1,132 @@
+"""What every forecaster offers: ``fit(sequences)`` once, then ``predict(history, horizon)``.
+
+Coordinates are normalised to the square crop of a sequence: x right and y down, 0 to 1.
+Legend: N sequences, T frames of history (or of a sequence), H horizon, L landmarks.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from face_prediction.errors import RequestError
+from face_prediction.tracks import NUM_LANDMARKS
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """Sequences to fit a forecaster to, and whose they are.
+
+    Raises:
+        RequestError: an array has another shape, or holds NaN or infinity.
+    """
+
+    #: (N, T, L, 2) landmarks, normalised to the crop of their sequence
+    landmarks: Array
+    #: N names: the person of each sequence
+    subjects: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        shape = self.landmarks.shape
+        if len(shape) != 4 or shape[2:] != (NUM_LANDMARKS, 2) or 0 in shape:
+            raise RequestError(
+                f"sequences of shape {shape}; expected (sequences, frames, {NUM_LANDMARKS}, 2)"
+            )
+        if len(self.subjects) != shape[0]:
+            raise RequestError(f"{len(self.subjects)} subjects for {shape[0]} sequences")
+        _require_finite("sequences", self.landmarks)
+
+
+class Forecaster(ABC):
+    """A forecaster with its fitted parameters; subclasses are frozen dataclasses of them.
+
+    Every one promises (and the tests ask each that is registered): nothing after the history is
+    looked at; rows of a batch do not touch one another; a face that is moved as a whole is
+    forecast moved by as much; a shorter horizon gives the first frames of a longer one; any
+    history of one frame or more is enough, the face being taken to have been at rest before it.
+    """
+
+    name: ClassVar[str]
+
+    @classmethod
+    @abstractmethod
+    def fit(cls, sequences: Sequences) -> Self:
+        """Fit to ``sequences`` of people other than those to be forecast."""
+
+    @property
+    @abstractmethod
+    def memory(self) -> int | None:
+        """Frames at the end of the history that count; None: all of them."""
+
+    @abstractmethod
+    def _forecast(self, history: Array, horizon: int) -> NDArray[np.float64]:
+        """Forecast (B, H, L, 2) from a checked history (B, T, L, 2) of at most ``memory``."""
+
+    def predict(self, history: Array, horizon: int) -> Array:
+        """Forecast the landmarks (..., H, L, 2) of the frames after ``history`` (..., T, L, 2).
+
+        Args:
+            history: the frames up to now, the newest last, at the rate fitted (30 a second).
+            horizon: frames to forecast, 1 or more.
+
+        Returns:
+            A new array of the dtype of ``history`` (float64 for integers).
+
+        Raises:
+            RequestError: a shape is another one, or the history holds NaN or infinity.
+        """
+        history = np.asarray(history)
+        if history.ndim < 3 or history.shape[-2:] != (NUM_LANDMARKS, 2):
+            raise RequestError(
+                f"history of shape {history.shape}; expected (..., frames, {NUM_LANDMARKS}, 2)"
+            )
+        if history.shape[-3] < 1:
+            raise RequestError("history of 0 frames; 1 or more are needed")
+        if horizon < 1:
+            raise RequestError(f"horizon {horizon}; must be 1 or more frames")
+        if self.memory is not None:
+            history = history[..., -self.memory :, :, :]
+        _require_finite("history", history)
+        rows = history.reshape(-1, *history.shape[-3:])
+        forecast = self._forecast(rows, horizon)
+        dtype = history.dtype if history.dtype.kind == "f" else np.float64
+        shape = (*history.shape[:-3], horizon, *history.shape[-2:])
+        return forecast.reshape(shape).astype(dtype, copy=False)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The fitted parameters as arrays, for a safetensors or ``.npz`` file."""
+        return {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}  # pyright: ignore[reportArgumentType]
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """The forecaster whose ``arrays()`` these are.
+
+        Raises:
+            RequestError: a parameter is missing or is not one of this forecaster.
+        """
+        wanted = {field.name for field in fields(cls)}  # pyright: ignore[reportArgumentType]
+        if set(arrays) != wanted:
+            raise RequestError(
+                f"{cls.name}: parameters {sorted(arrays)} stored, expected {sorted(wanted)}"
+            )
+        values = {
+            name: array.item() if np.ndim(array) == 0 else np.asarray(array)
+            for name, array in arrays.items()
+        }
+        return cls(**values)
+
+
+def _require_finite(what: str, values: Array) -> None:
+    # a sum is NaN or infinite if any term is: no array of booleans as large as the data
+    if not np.isfinite(values.sum(dtype=np.float64)):
+        raise RequestError(f"{what}: NaN or infinity in it; leave out frames without a face")
