@@ -7,12 +7,18 @@ from importlib.util import find_spec
 
 from robo_manip_baselines.errors import RequestError
 
-PACKAGES = {"torch": "torch", "safetensors": "safetensors", "yaml": "PyYAML", "statsmodels": "statsmodels"}
+PACKAGES = {
+    "torch": "torch",
+    "safetensors": "safetensors",
+    "yaml": "PyYAML",
+    "statsmodels": "statsmodels",
+}
 """Module -> distribution."""
 
 SPINS = 3000
-"""Spins of an OpenMP thread before it sleeps, some 10 us. Chosen with the preset ``cpu`` on two cores:
-0 spins gave 13 steps/s idle and 11 beside a busy program, 3000 gave 20 and 9, 30 000 gave 21 and 5."""
+"""Spins of an OpenMP thread before it sleeps, some 10 us. Chosen with ACT's preset ``cpu`` on two
+cores: 0 gave 13 steps/s idle and 11 beside a busy program, 3000 gave 20 and 9, 30 000 gave 21 and
+5."""
 
 
 def prepare_pytorch() -> None:

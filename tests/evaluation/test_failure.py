@@ -18,7 +18,7 @@ BELOW = float(np.nextafter(0.06, 0.0))  # m, just at the face
     ("offset", "released", "kind"),
     [
         (None, False, "never_grasped"),
-        # Not at the face, or in front of the mouth: what counts is whether the cube was still there.
+        # Not at the face, or in front of the mouth: is the cube still there?
         ((0.15, 0.0, 0.0), True, "dropped"),
         ((0.15, 0.0, 0.0), False, "too_late"),
         ((0.03, 0.0, 0.0), True, "dropped"),
@@ -28,7 +28,7 @@ BELOW = float(np.nextafter(0.06, 0.0))  # m, just at the face
         ((-0.06, 0.2, -0.3), True, "dropped"),
         ((BELOW, 0.009, -0.009), True, "dropped"),
         ((BELOW, 0.009, -0.009), False, "too_late"),
-        # At the face and beside the mouth: the larger part across the face; letting go beside the mouth is a miss.
+        # At the face and beside the mouth: the larger part across; letting go there is a miss.
         ((BELOW, 0.0, 0.012), False, "missed_high"),
         ((BELOW, 0.0, 0.012), True, "missed_high"),
         ((-BELOW, 0.0, -0.012), True, "missed_low"),
