@@ -21,6 +21,10 @@ class Attribution:
     ship: bool
     licence: str
     source: str
+    #: kind of footage, from the optional column ``kind``
+    kind: str = ""
+    #: what is to be seen, from the optional column ``what``
+    what: str = ""
 
     def record(self) -> dict[str, str]:
         """What is kept in a library: everything but the clip's name and ``ship``."""
@@ -30,8 +34,9 @@ class Attribution:
 def read_attributions(path: Path) -> dict[str, Attribution]:
     """Rows of a table with the columns clip, subject, ship (yes or no), licence and source.
 
-    The file is a ``.csv`` with a header line, or a Markdown file with such a table in it; other
-    columns, text and tables are passed over.
+    Columns ``kind`` and ``what`` are read where there are any. The file is a ``.csv`` with a header
+    line, or a Markdown file with such a table in it; other columns, text and tables are passed
+    over.
 
     Raises:
         RequestError: the file cannot be read, has no such table, or a row is incomplete.
@@ -75,7 +80,15 @@ def _attribution(path: Path, row: dict[str, str]) -> Attribution:
             f"--attribution {path}: ship '{row['ship']}' in the row of '{row['clip']}'; yes or no"
         )
     clip = Path(row["clip"]).stem
-    return Attribution(clip, row["subject"], ship == "yes", row["licence"], row["source"])
+    return Attribution(
+        clip,
+        row["subject"],
+        ship == "yes",
+        row["licence"],
+        row["source"],
+        kind=row.get("kind", ""),
+        what=row.get("what", ""),
+    )
 
 
 def _markdown_rows(lines: list[str]) -> list[list[str]]:

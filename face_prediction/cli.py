@@ -1,4 +1,4 @@
-"""The command line: ``face-prediction extract | export-motion | export-surface``."""
+"""The command line: ``face-prediction extract | export-motion | …``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from face_prediction.dataset.build_command import BuildDatasetOptions, run_build_dataset
 from face_prediction.errors import RequestError
 from face_prediction.extract_command import ExtractOptions, run_extract
 from face_prediction.motion_command import ExportMotionOptions, run_export_motion
@@ -23,11 +24,12 @@ _FRAME = re.compile(r"^[\s│|╭╰─+-]+|[\s│|╮╯─+-]+$")
 
 logger = logging.getLogger(__name__)
 
-DESCRIPTION = """Faces in video: tracks, and the motion and the surface lifted from them.
+DESCRIPTION = """Faces in video: tracks; motion and surface lifted from them; training sequences.
 
 Example:
   face-prediction extract clips/*.mp4 --out face_tracks
   face-prediction export-motion face_tracks --attribution clips.csv --out face_motion.npz
+  face-prediction build-dataset face_tracks --videos clips --attribution clips.csv
 """
 
 #: (name, options, function) of every subcommand
@@ -35,6 +37,7 @@ COMMANDS: tuple[tuple[str, type, Callable[[Any], int | None]], ...] = (
     ("extract", ExtractOptions, run_extract),
     ("export-motion", ExportMotionOptions, run_export_motion),
     ("export-surface", ExportSurfaceOptions, export_surface),
+    ("build-dataset", BuildDatasetOptions, run_build_dataset),
 )
 
 

@@ -16,13 +16,13 @@ from face_prediction.errors import RequestError
 from face_prediction.lifting import jaw_openings, mouth_centres
 from face_prediction.motion import has_constant_rate
 from face_prediction.quality import Quality, assess
-from face_prediction.resample import MAX_GAP, SAME_TIME, Samples, resample
+from face_prediction.resample import SAME_TIME, Samples, resample
 from face_prediction.rigid_pose import rigid_head_poses
 from face_prediction.rotations import quaternion_from_matrix
 from face_prediction.tracks import FaceTrack
 
 #: Why a sequence is dropped; the first that holds is counted.
-REASONS = ("no_face", "jump", "spike")
+REASONS: tuple[str, ...] = ("no_face", "jump", "spike")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def find_sequences(frames: ClipFrames, settings: SequenceSettings) -> Sequences:
     length = settings.length
     starts = range(0, len(frames) - length + 1, settings.stride)
     kept: list[int] = []
-    dropped = dict.fromkeys(REASONS, 0)
+    dropped: dict[str, int] = dict.fromkeys(REASONS, 0)
     for start in starts:
         reason = why_dropped(frames.quality, start, start + length)
         if reason is None:
@@ -127,8 +127,7 @@ def _at_rate(track: FaceTrack, fps: float) -> tuple[Samples, np.ndarray]:
     samples = Samples(track.timestamps, track.landmarks, track.head_pose, track.valid)
     if abs(track.fps - fps) < 1e-6 * fps and has_constant_rate(track):
         return samples, track.interpolated
-    # a track kept at coarse steps may still be joined: its own step is no gap
-    resampled, made = resample(samples, fps, max(MAX_GAP, 1.5 / track.fps))
+    resampled, made = resample(samples, fps)
     after = np.searchsorted(track.timestamps, resampled.timestamps - SAME_TIME)
     after = np.clip(after, 0, len(track) - 1)
     before = np.maximum(after - 1, 0)
@@ -137,7 +136,11 @@ def _at_rate(track: FaceTrack, fps: float) -> tuple[Samples, np.ndarray]:
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Index into increasing ``times`` (S,) of the one nearest to each of ``wanted`` (T,)."""
+    """Index into increasing ``times`` (S,) of the one nearest to each of ``wanted`` (T,).
+
+    Of two as near, the earlier one.
+    """
     after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(wanted - times[before] <= times[after] - wanted, before, after)
+    later = wanted - times[before] > times[after] - wanted + SAME_TIME
+    return np.where(later, after, before)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from face_prediction.forecast.interface import Forecaster, Sequences
+from face_prediction.forecast.interface import Forecaster, LandmarkSequences
 from face_prediction.forecast.mouth import mouth_centre
 from face_prediction.forecast.registry import FORECASTERS, fit_forecaster, restore_forecaster
 
 __all__ = [
     "FORECASTERS",
     "Forecaster",
-    "Sequences",
+    "LandmarkSequences",
     "fit_forecaster",
     "mouth_centre",
     "restore_forecaster",

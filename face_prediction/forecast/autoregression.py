@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.errors import RequestError
-from face_prediction.forecast.interface import Array, Forecaster, Sequences
+from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences
 from face_prediction.forecast.least_squares import (
     choose,
     forecast,
@@ -54,7 +54,7 @@ class MouthAutoregression(Forecaster):
         _check_coefficients(self.name, self.coefficients, 2)
 
     @classmethod
-    def fit(cls, sequences: Sequences, order: int | None = None) -> Self:
+    def fit(cls, sequences: LandmarkSequences, order: int | None = None) -> Self:
         """Fit to the mouth centres, with ``order`` or the best of `MOUTH_ORDERS`.
 
         Raises:
@@ -98,7 +98,9 @@ class LandmarkAutoregression(Forecaster):
             )
 
     @classmethod
-    def fit(cls, sequences: Sequences, order: int | None = None, components: int = 8) -> Self:
+    def fit(
+        cls, sequences: LandmarkSequences, order: int | None = None, components: int = 8
+    ) -> Self:
         """Fit with ``order`` and ``components``, or, without an order, with the best pair.
 
         Raises:

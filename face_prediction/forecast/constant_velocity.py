@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.errors import RequestError
-from face_prediction.forecast.interface import Array, Forecaster, Sequences
+from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -36,7 +36,7 @@ class ConstantVelocity(Forecaster):
             raise RequestError(f"constant_velocity: window {self.window}; must be 1 or more frames")
 
     @classmethod
-    def fit(cls, sequences: Sequences) -> Self:
+    def fit(cls, sequences: LandmarkSequences) -> Self:
         """Nothing is fitted."""
         return cls()
 
@@ -67,7 +67,7 @@ class Line(Forecaster):
             raise RequestError(f"line: {self.frames} frames; must be 2 or more")
 
     @classmethod
-    def fit(cls, sequences: Sequences) -> Self:
+    def fit(cls, sequences: LandmarkSequences) -> Self:
         """Nothing is fitted: it is the rule of thumb that needs no data."""
         return cls()
 
@@ -79,7 +79,7 @@ class Line(Forecaster):
     def _forecast(self, history: Array, horizon: int) -> NDArray[np.float64]:
         frames = history.shape[1]
         time = np.arange(frames) - (frames - 1) / 2  # about the middle of the line
-        spread = max(float(time @ time), 1.0)
+        spread = float(time @ time) or 1.0  # one frame: no spread, and no velocity
         velocity = np.einsum("t,btlc->blc", time / spread, history)
         middle = history.mean(axis=1, dtype=np.float64)
         return middle[:, None] + ((frames - 1) / 2 + _ahead(horizon)) * velocity[:, None]

@@ -24,7 +24,7 @@ Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
-class Sequences:
+class LandmarkSequences:
     """Sequences to fit a forecaster to, and whose they are.
 
     Raises:
@@ -60,7 +60,7 @@ class Forecaster(ABC):
 
     @classmethod
     @abstractmethod
-    def fit(cls, sequences: Sequences) -> Self:
+    def fit(cls, sequences: LandmarkSequences) -> Self:
         """Fit to ``sequences`` of people other than those to be forecast."""
 
     @property
@@ -83,7 +83,7 @@ class Forecaster(ABC):
             A new array of the dtype of ``history`` (float64 for integers).
 
         Raises:
-            RequestError: a shape is another one, or the history holds NaN or infinity.
+            RequestError: a shape is another one, or a frame that counts holds NaN or infinity.
         """
         history = np.asarray(history)
         if history.ndim < 3 or history.shape[-2:] != (NUM_LANDMARKS, 2):
@@ -128,5 +128,7 @@ class Forecaster(ABC):
 
 def _require_finite(what: str, values: Array) -> None:
     # a sum is NaN or infinite if any term is: no array of booleans as large as the data
-    if not np.isfinite(values.sum(dtype=np.float64)):
+    with np.errstate(invalid="ignore"):  # infinity less infinity
+        total = values.sum(dtype=np.float64)
+    if not np.isfinite(total):
         raise RequestError(f"{what}: NaN or infinity in it; leave out frames without a face")

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from face_prediction.errors import RequestError
-from face_prediction.forecast.interface import Array, Forecaster, Sequences
+from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences
 from face_prediction.forecast.mouth import mouth_centre
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class KalmanConstantVelocity(Forecaster):
                 raise RequestError(f"kalman: {field} {value}; expected two positive numbers")
 
     @classmethod
-    def fit(cls, sequences: Sequences) -> Self:
+    def fit(cls, sequences: LandmarkSequences) -> Self:
         """Fit q, r and v of each axis to the mouth centres by maximum likelihood.
 
         Raises:

@@ -112,7 +112,20 @@ def choose(
     candidates: Iterable[tuple[int, int]],
     horizon: int,
 ) -> tuple[int, int]:
-    """The (order, components) with the least error on subjects that were not fitted to.
+    """The (order, components) with the least of `held_out_errors`; the smaller of equal ones."""
+    errors = held_out_errors(series, mouth, readout, subjects, candidates, horizon)
+    return min(sorted(errors), key=errors.__getitem__)
+
+
+def held_out_errors(
+    series: Floats,
+    mouth: Floats,
+    readout: Floats,
+    subjects: tuple[str, ...],
+    candidates: Iterable[tuple[int, int]],
+    horizon: int,
+) -> dict[tuple[int, int], float]:
+    """Error of each (order, components) on subjects that were not fitted to.
 
     Args:
         series: (N, T, D) displacements, the components most worth keeping first.
@@ -125,7 +138,7 @@ def choose(
     Raises:
         RequestError: all sequences are of one subject, or too short for the candidates.
     """
-    wanted = sorted(candidates)
+    wanted = list(candidates)
     longest = max(order for order, _ in wanted)
     if len(set(subjects)) < 2:
         raise RequestError(
@@ -136,17 +149,19 @@ def choose(
     fold = subject_folds(subjects, FOLDS)
     parts = [moments(series[fold == f], longest) for f in range(fold.max() + 1)]
     whole = sum(parts[1:], parts[0])
-    errors = np.zeros(len(wanted))
+    totals = dict.fromkeys(wanted, 0.0)
     for f, part in enumerate(parts):
         rest = whole - part
-        for index, (order, components) in enumerate(wanted):
+        for order, components in wanted:
             coefficients = solve(rest, order, components)
             for origin in origins:
                 recent = series[fold == f, :origin, :components]
                 ahead = forecast(coefficients, recent, horizon) @ readout[:components]
                 true = mouth[fold == f, origin : origin + horizon]
-                errors[index] += np.abs(np.cumsum(ahead - true, axis=1)).sum()
-    return wanted[int(np.argmin(errors))]
+                error = np.abs(np.cumsum(ahead - true, axis=1)).sum()
+                totals[order, components] += float(error)
+    count = len(series) * len(origins) * horizon * 2
+    return {pair: total / count for pair, total in totals.items()}
 
 
 def require_order(order: int, steps: int) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.forecast.interface import Array, Forecaster, Sequences
+from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -21,7 +21,7 @@ class Persistence(Forecaster):
     name = "persistence"
 
     @classmethod
-    def fit(cls, sequences: Sequences) -> Self:
+    def fit(cls, sequences: LandmarkSequences) -> Self:
         """Nothing is fitted."""
         return cls()
 

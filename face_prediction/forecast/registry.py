@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from face_prediction.errors import RequestError
 from face_prediction.forecast.autoregression import LandmarkAutoregression, MouthAutoregression
 from face_prediction.forecast.constant_velocity import ConstantVelocity, Line
-from face_prediction.forecast.interface import Forecaster, Sequences
+from face_prediction.forecast.interface import Forecaster, LandmarkSequences
 from face_prediction.forecast.kalman import KalmanConstantVelocity
 from face_prediction.forecast.persistence import Persistence
 
@@ -27,7 +27,7 @@ FORECASTERS: dict[str, type[Forecaster]] = {
 }
 
 
-def fit_forecaster(name: str, sequences: Sequences) -> Forecaster:
+def fit_forecaster(name: str, sequences: LandmarkSequences) -> Forecaster:
     """Fit the forecaster called ``name``.
 
     Raises:

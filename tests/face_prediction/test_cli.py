@@ -20,7 +20,7 @@ def python(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProc
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ((), ("extract", "export-motion", "export-surface", "Example:")),
+        ((), ("extract", "export-motion", "export-surface", "build-dataset", "Example:")),
         (("extract",), ("Example: face-prediction extract", "(default: 30.0)", "--running_mode")),
         (("export-motion",), ("Example: face-prediction", "(default: 0.08)", "--max_rotation")),
         (("export-surface",), ("Example: face-prediction", "--attribution")),

@@ -23,7 +23,7 @@ class MlpConfig:
         RequestError: a value that is not valid.
     """
 
-    chunk_size: int = 20
+    chunk_size: int = 30
     hidden_size: int = 512
     hidden_layers: int = 3
     dropout: float = 0.0
@@ -40,9 +40,18 @@ PRESETS = {
     "cpu": PolicyPreset(
         config=MlpConfig(),
         training=TrainSettings(
-            batch_size=256, learning_rate=1e-3, schedule="cosine", sampler="frame", steps=10_000
+            batch_size=256,
+            learning_rate=1e-3,
+            schedule="cosine",
+            warmup_steps=100,
+            sampler="frame",
+            steps=6000,
+            state_noise=0.2,
+            clock_noise=0.5,
+            validation_fraction=0.0,
+            ema_decay=0.999,
         ),
-        acting=Acting(temporal_ensemble=True),
+        acting=Acting(temporal_ensemble=False, execute=10),
         cameras=(),
         object_pose=True,
     )

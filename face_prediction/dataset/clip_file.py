@@ -1,0 +1,174 @@
+"""The file of one clip: its frames as numbers, once, and the pictures of each sequence.
+
+Legend: T frames, N sequences, F frames of one, P pictures, L = 468 landmarks.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from face_prediction.dataset.facts import FACTS
+from face_prediction.dataset.pictures import checksum
+from face_prediction.dataset.sequences import ClipFrames, Sequences
+from face_prediction.dataset.whole_file import whole_file
+from face_prediction.errors import RequestError
+
+SCHEMA = "face_dataset_clip"
+VERSION = 1
+#: From this release of the file format on, HDF5 keeps checksums of its own structure.
+_HDF5_FORMAT = ("v110", "v110")
+#: Of the pictures' bytes; a sequence of 256 x 256 pictures is some ten of these.
+_CHUNK_BYTES = 65536
+#: Frames of landmarks in one piece: a sequence reads three or four.
+_CHUNK_FRAMES = 25
+#: What h5py and HDF5 raise on damaged bytes.
+READ_ERRORS = (KeyError, ValueError, OSError, RuntimeError, TypeError, OverflowError, MemoryError)
+
+#: Arrays of a clip, a row for each frame: name, shape after T, type, unit, what it is.
+FRAME_ARRAYS: tuple[tuple[str, tuple[int, ...], str, str, str], ...] = (
+    ("landmarks", (468, 3), "float32", "image", "Normalised image coordinates, as in a FaceTrack"),
+    ("valid", (), "bool", "", "The face was found"),
+    ("interpolated", (), "bool", "", "Made from two decoded frames"),
+    ("timestamps", (), "float64", "s", "On the video's clock"),
+    ("mouth", (3,), "float64", "m", "Mouth centre, camera frame"),
+    ("orientation", (4,), "float64", "1", "Quaternion w, x, y, z: camera from head"),
+    ("jaw", (), "float64", "m", "Between the inner lips"),
+    ("source_frame", (), "int64", "", "The decoded frame nearest in time"),
+    ("image_lag", (), "float64", "s", "That frame's time less this one's"),
+)
+
+
+@dataclass(frozen=True)
+class EncodedPictures:
+    """Pictures of the sequences of a clip, each once, in the order of the sequences."""
+
+    #: P arrays of JPEG bytes
+    encoded: Sequence[np.ndarray]
+    #: (N, F) int: which of them stands for each frame
+    index: np.ndarray
+
+
+def write_clip(
+    path: Path,
+    frames: ClipFrames,
+    sequences: Sequences,
+    pictures: EncodedPictures,
+    facts: Mapping[str, np.ndarray],
+    record: Mapping[str, Any],
+) -> None:
+    """Write the file of one clip, whole or not at all. The same content gives the same bytes.
+
+    Args:
+        path: the file; replaced if it is there.
+        frames: of the whole clip.
+        sequences: starts, crops and counts.
+        pictures: of the sequences.
+        facts: the columns of `FACTS`, each (N,).
+        record: JSON that says what the file was made from and how; see `build.clip_record`.
+    """
+    sizes = [len(data) for data in pictures.encoded]
+    with whole_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
+        file.attrs["schema"] = SCHEMA
+        file.attrs["version"] = VERSION
+        file.attrs["record"] = json.dumps(dict(record), sort_keys=True)
+        counts = {
+            "image_size": list(frames.image_size),
+            "sequences": len(sequences),
+            "candidates": sequences.candidates,
+            "dropped": dict(sequences.dropped),
+        }
+        file.attrs["counts"] = json.dumps(counts, sort_keys=True)
+        for name, shape, dtype, unit, description in FRAME_ARRAYS:
+            values = np.asarray(getattr(frames, name)).astype(dtype)
+            if values.shape != (len(frames), *shape):
+                raise ValueError(f"'{name}' is {values.shape}, not {(len(frames), *shape)}")
+            item = _write(file, f"frames/{name}", values, _CHUNK_FRAMES if shape == (468, 3) else 0)
+            item.attrs["unit"], item.attrs["description"] = unit, description
+        _write(file, "sequences/start", sequences.start.astype(np.int64))
+        corners = [(crop.left, crop.top, crop.side) for crop in sequences.crops]
+        _write(file, "sequences/crop", np.array(corners, dtype=np.int64).reshape(-1, 3))
+        for fact in FACTS:
+            item = _write(file, f"sequences/{fact.name}", facts[fact.name].astype(np.float64))
+            item.attrs["unit"], item.attrs["description"] = fact.unit, fact.description
+        _write(file, "pictures/index", pictures.index.astype(np.int64))
+        _write(file, "pictures/offset", np.cumsum([0, *sizes], dtype=np.int64))
+        sums = [checksum(data) for data in pictures.encoded]
+        _write(file, "pictures/checksum", np.array(sums, dtype=np.uint32))
+        whole = np.concatenate([*pictures.encoded, np.zeros(0, dtype=np.uint8)])
+        _write(file, "pictures/data", whole, _CHUNK_BYTES)
+
+
+def _write(file: h5py.File, name: str, values: np.ndarray, chunk: int = 0) -> h5py.Dataset:
+    """An array with checksums, in pieces of ``chunk`` rows (0: all)."""
+    if not len(values):
+        return file.create_dataset(name, data=values, track_times=False)
+    rows = min(chunk or len(values), len(values))
+    shape = (rows, *values.shape[1:])
+    return file.create_dataset(name, data=values, chunks=shape, fletcher32=True, track_times=False)
+
+
+def open_clip(path: Path) -> h5py.File:
+    """Open the file of a clip for reading; the caller closes it.
+
+    Raises:
+        RequestError: it is absent, damaged, or of another schema or version.
+    """
+    if not path.is_file():
+        raise RequestError(f"{path}: no such file; expected a '{SCHEMA}' .h5")
+    try:
+        file = h5py.File(path, "r")
+    except READ_ERRORS as error:
+        raise RequestError(f"{path}: {damage(error)}") from None
+    try:
+        schema, version = file.attrs.get("schema"), file.attrs.get("version")
+    except READ_ERRORS as error:
+        file.close()
+        raise RequestError(f"{path}: {damage(error)}") from None
+    if schema != SCHEMA or version != VERSION:
+        file.close()
+        raise RequestError(
+            f"{path}: schema '{schema}' version {version}, expected '{SCHEMA}' {VERSION}; "
+            "make the dataset again"
+        )
+    return file
+
+
+def read_array(path: Path, file: h5py.File, name: str, rows: Any = ()) -> np.ndarray:
+    """Rows of one array of an open clip file.
+
+    Raises:
+        RequestError: it is missing or damaged; the message names file and array.
+    """
+    try:
+        item = file[name]
+        if not isinstance(item, h5py.Dataset):
+            raise KeyError("no array")
+        return np.asarray(item[rows])
+    except READ_ERRORS as error:
+        raise RequestError(f"{path}: '{name}': {damage(error)}") from None
+
+
+def read_record(path: Path, file: h5py.File) -> dict[str, Any]:
+    """What the file was made from and how, with ``image_size`` and the counts.
+
+    Raises:
+        RequestError: it is damaged.
+    """
+    try:
+        record = json.loads(str(file.attrs["record"]))
+        return {**record, **json.loads(str(file.attrs["counts"]))}
+    except READ_ERRORS as error:
+        raise RequestError(f"{path}: {damage(error)}") from None
+
+
+def damage(error: BaseException) -> str:
+    """One line on an error of `READ_ERRORS`."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return f"damaged ({text[:160]}); make the dataset again"

@@ -1,0 +1,261 @@
+"""Reading a dataset back, one sequence at a time.
+
+Legend: F frames of a sequence, H history, L = 468 landmarks, S side of the pictures.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from face_prediction.dataset.clip_file import damage, open_clip, read_array, read_record
+from face_prediction.dataset.crop import Crop
+from face_prediction.dataset.facts import FACTS
+from face_prediction.dataset.manifest import CLIP_FOLDER, ClipEntry, SequenceRow, read_manifest
+from face_prediction.dataset.pictures import REDUCTIONS, checksum, decode_picture
+from face_prediction.dataset.split import FoldSplit, fold_split
+from face_prediction.errors import RequestError
+
+#: Clip files kept open at once; a process may open some thousand.
+MAX_OPEN = 64
+
+
+@dataclass(frozen=True)
+class FaceSequence:
+    """One sequence: what a camera with a fixed picture would have seen, and what it shows."""
+
+    #: (F, S, S, 3) uint8 RGB
+    pictures: np.ndarray
+    #: (F, 468, 3) float32: u right and v down, 0...1 across the picture, and MediaPipe's relative
+    #: depth in the same unit
+    landmarks: np.ndarray
+    #: (F,) float64 s on the video's clock
+    timestamps: np.ndarray
+    #: (F,) bool: landmarks made from two decoded frames
+    interpolated: np.ndarray
+    #: (F,) float64 s: time of the picture less that of the frame (pictures are never mixed)
+    image_lag: np.ndarray
+    #: (F, 3) float64 m, mouth centre in the camera frame
+    mouth: np.ndarray
+
+
+class FaceDataset:
+    """A dataset made by ``face-prediction build-dataset``, open for reading.
+
+    Sequences are counted from 0 through all clips, in the order of ``manifest.clips``. Nothing but
+    the list of clips is read until a sequence is asked for. May be pickled and forked: every
+    process opens files of its own.
+
+    Attributes:
+        folder: where it is.
+        manifest: clips, settings and folds.
+
+    Raises:
+        RequestError: there is no dataset, or one of another schema.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.manifest = read_manifest(self.folder)
+        counts = [clip.sequences for clip in self.manifest.clips]
+        self._ends = np.cumsum(counts, dtype=np.int64)
+        self._files: OrderedDict[int, _ClipReader] = OrderedDict()
+        self._process = os.getpid()
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __enter__(self) -> FaceDataset:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_files": OrderedDict()}
+
+    def close(self) -> None:
+        """Close all files; they are opened again when needed."""
+        for reader in self._files.values():
+            reader.file.close()
+        self._files.clear()
+
+    def entry(self, index: int) -> ClipEntry:
+        """The clip that sequence ``index`` is from."""
+        return self.manifest.clips[self._place(index)[0]]
+
+    def indices(
+        self, folds: Collection[int] | None = None, kinds: Collection[str] | None = None
+    ) -> np.ndarray:
+        """(N,) int: the sequences of these folds and kinds of footage; None: of all."""
+        clips = self.manifest.clips
+        keep = [
+            (folds is None or clip.fold in folds) and (kinds is None or clip.kind in kinds)
+            for clip in clips
+        ]
+        return np.flatnonzero(np.repeat(keep, [clip.sequences for clip in clips]))
+
+    def split(self, test: int) -> FoldSplit:
+        """The split that reports on fold ``test``; see `fold_split`."""
+        return fold_split(self.manifest.folds, test)
+
+    def landmarks(self, index: int) -> np.ndarray:
+        """(F, 468, 3) float32 in the picture's coordinates, without reading pictures."""
+        reader, number = self._reader(index)
+        return reader.landmarks(number)
+
+    def pictures(self, index: int, frames: slice | None = None, reduce: int = 1) -> np.ndarray:
+        """Pictures (F, S / reduce, S / reduce, 3) uint8 RGB; only those of ``frames`` are decoded.
+
+        Raises:
+            RequestError: the bytes are damaged.
+            ValueError: ``reduce`` is not 1, 2, 4 or 8.
+        """
+        reader, number = self._reader(index)
+        return reader.pictures(number, frames or slice(None), reduce)
+
+    def read(self, index: int, reduce: int = 1) -> FaceSequence:
+        """One whole sequence. Raises as `pictures` does."""
+        reader, number = self._reader(index)
+        rows = reader.rows(number)
+        return FaceSequence(
+            pictures=reader.pictures(number, slice(None), reduce),
+            landmarks=reader.landmarks(number),
+            timestamps=reader.array("frames/timestamps", rows),
+            interpolated=reader.array("frames/interpolated", rows),
+            image_lag=reader.array("frames/image_lag", rows),
+            mouth=reader.array("frames/mouth", rows),
+        )
+
+    def rows(self) -> list[SequenceRow]:
+        """The table of all sequences, read from the clips' files."""
+        result: list[SequenceRow] = []
+        for place, clip in enumerate(self.manifest.clips):
+            if not clip.sequences or clip.fold is None:
+                continue
+            reader = self._open(place)
+            columns = {fact.name: reader.array(f"sequences/{fact.name}") for fact in FACTS}
+            for number, start in enumerate(reader.start.tolist()):
+                facts = {name: float(column[number]) for name, column in columns.items()}
+                result.append(
+                    SequenceRow(clip.clip, number, clip.subject, clip.kind, clip.fold, start, facts)
+                )
+        return result
+
+    def _place(self, index: int) -> tuple[int, int]:
+        """Which clip sequence ``index`` is from, and its number in it."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"sequence {index}: {self.folder} has {len(self)}")
+        place = int(np.searchsorted(self._ends, index, side="right"))
+        return place, int(index - self._ends[place] + self.manifest.clips[place].sequences)
+
+    def _reader(self, index: int) -> tuple[_ClipReader, int]:
+        place, number = self._place(index)
+        return self._open(place), number
+
+    def _open(self, place: int) -> _ClipReader:
+        if self._process != os.getpid():  # forked: these handles are the parent's
+            self._files = OrderedDict()
+            self._process = os.getpid()
+        if place in self._files:
+            self._files.move_to_end(place)
+            return self._files[place]
+        clip = self.manifest.clips[place]
+        path = self.folder / CLIP_FOLDER / f"{clip.clip}.h5"
+        reader = _ClipReader(path, open_clip(path), self.manifest.settings.length)
+        try:
+            reader.require(clip, self.manifest.settings.to_json())
+        except RequestError:
+            reader.file.close()
+            raise
+        self._files[place] = reader
+        if len(self._files) > MAX_OPEN:
+            _, oldest = self._files.popitem(last=False)
+            oldest.file.close()
+        return reader
+
+
+class _ClipReader:
+    """The open file of one clip."""
+
+    def __init__(self, path: Path, file: h5py.File, length: int) -> None:
+        self.path = path
+        self.file = file
+        self._length = length
+        self._record = read_record(path, file)
+        self.start = self.array("sequences/start")
+        self._crops = self.array("sequences/crop")
+        self._index = self.array("pictures/index")
+        self._offset = self.array("pictures/offset")
+        self._checksum = self.array("pictures/checksum")
+        width, height = self._record["image_size"]
+        self._image_size = (int(width), int(height))
+
+    def array(self, name: str, rows: Any = ()) -> np.ndarray:
+        return read_array(self.path, self.file, name, rows)
+
+    def rows(self, number: int) -> slice:
+        start = int(self.start[number])
+        return slice(start, start + self._length)
+
+    def require(self, clip: ClipEntry, settings: dict[str, Any]) -> None:
+        """Check that the file is the one that the list of clips means.
+
+        Raises:
+            RequestError: it was made from something else, or with other settings.
+        """
+        wanted = {
+            "clip": clip.clip,
+            "track_sha256": clip.track_sha256,
+            "video_sha256": clip.video_sha256,
+            "settings": settings,
+        }
+        wrong = [key for key, value in wanted.items() if self._record.get(key) != value]
+        if len(self.start) != clip.sequences or self._index.shape != (
+            clip.sequences,
+            self._length,
+        ):
+            wrong.append("sequences")
+        if wrong:
+            raise RequestError(
+                f"{self.path}: its {', '.join(wrong)} are not those of the dataset; "
+                "make the dataset again"
+            )
+
+    def landmarks(self, number: int) -> np.ndarray:
+        crop = Crop(*map(int, self._crops[number]))
+        points = self.array("frames/landmarks", self.rows(number))
+        return crop.normalise(points, self._image_size).astype(np.float32)
+
+    def pictures(self, number: int, frames: slice, reduce: int) -> np.ndarray:
+        if reduce not in REDUCTIONS:
+            raise ValueError(f"reduce {reduce}: one of {', '.join(map(str, REDUCTIONS))}")
+        index = self._index[number][frames]
+        if not len(index):
+            raise ValueError("no frame asked for")
+        wanted, place = np.unique(index, return_inverse=True)
+        first = int(self._offset[wanted[0]])
+        data = self.array("pictures/data", slice(first, int(self._offset[wanted[-1] + 1])))
+        images: list[np.ndarray] = []
+        for picture in wanted.tolist():
+            encoded = data[self._offset[picture] - first : self._offset[picture + 1] - first]
+            try:
+                if checksum(encoded) != int(self._checksum[picture]):
+                    raise ValueError("its checksum is wrong")
+                images.append(decode_picture(encoded, reduce))
+            except ValueError as error:
+                raise RequestError(f"{self.path}: picture {picture}: {damage(error)}") from None
+        return np.stack(images)[place]
