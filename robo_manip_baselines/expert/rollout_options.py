@@ -44,7 +44,7 @@ class PolicyOptions:
     device: str = "auto"
     """Where the network runs: auto, cpu, cuda or cuda:1."""
     precision: str = "fp32"
-    """fp32, or bf16 for autocast."""
+    """fp32, or bf16 for the products inside the network."""
     video: int = 0
     """Videos to write: of the first successes and the first failures, half of each."""
     obs: str | None = None
