@@ -20,7 +20,10 @@ from robo_manip_baselines.training.train_command import train
 
 pytestmark = pytest.mark.long
 
-TINY = "--preset cpu --chunk_size 3 --hidden_size 8 --batch_size 4 --log_every 5 --logger none"
+TINY = (
+    "--preset cpu --chunk_size 3 --hidden_size 8 --batch_size 4 --validation_fraction 0.2 "
+    "--log_every 5 --logger none"
+)
 LONG = 1_000_000  # steps that no test waits for
 TIMEOUT = 120.0  # seconds; hangs fail, slow machines do not
 
