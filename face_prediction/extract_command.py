@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.detector import DetectorSettings, FaceDetector, RunningMode
 from face_prediction.errors import RequestError
 from face_prediction.extract import ExtractSettings, extract_track, is_up_to_date
 from face_prediction.model_file import find_model
+from face_prediction.progress import FrameBar
 from face_prediction.tracks import save_track
-from face_prediction.video import VideoFrame, require_video, sha256_of
+from face_prediction.video import require_video, sha256_of
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ def run_extract(options: ExtractOptions) -> int:
                     kept += 1
                     logger.info("%s%s: up to date", prefix, out)
                     continue
-                bar = _ProgressBar(prefix, options.progress)
+                bar = FrameBar(prefix, options.progress)
                 track = extract_track(video, detector, settings, bar)
             save_track(out, track)
         except RequestError as error:
@@ -130,21 +130,3 @@ def output_paths(videos: Iterable[Path], out: Path) -> list[tuple[Path, Path]]:
             )
         seen[path] = video
     return pairs
-
-
-@dataclass(frozen=True)
-class _ProgressBar:
-    prefix: str
-    shown: bool
-
-    def __call__(
-        self, frames: Iterable[VideoFrame], total: int | None, name: str
-    ) -> Iterable[VideoFrame]:
-        return tqdm(
-            frames,
-            total=total,
-            desc=self.prefix + name,
-            unit="frame",
-            leave=False,
-            disable=not self.shown,
-        )

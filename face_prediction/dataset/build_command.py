@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
-from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.attribution import Attribution, read_attributions
@@ -31,8 +30,8 @@ from face_prediction.dataset.settings import CropFrom, SequenceSettings
 from face_prediction.dataset.split import Amount, assign_folds, require_fold_options
 from face_prediction.errors import RequestError
 from face_prediction.motion_command import track_files
+from face_prediction.progress import FrameBar
 from face_prediction.tracks import load_track
-from face_prediction.video import VideoFrame
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +113,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> int:
         try:
             source = ClipSource(path.stem, path, video_of(path, videos))
             with logging_redirect_tqdm():
-                is_made = build_clip(source, out, settings, _Bar(prefix, options.progress))
+                is_made = build_clip(source, out, settings, FrameBar(prefix, options.progress))
         except RequestError as error:
             if len(paths) == 1:
                 raise
@@ -273,19 +272,3 @@ def refuse_other_folder(out: Path) -> None:
             raise RequestError(
                 f"--out {out}: holds {', '.join(others[:3])} and no dataset; name another folder"
             )
-
-
-@dataclass(frozen=True)
-class _Bar:
-    prefix: str
-    shown: bool
-
-    def __call__(self, frames: Iterable[VideoFrame], total: int, name: str) -> Iterable[VideoFrame]:
-        return tqdm(
-            frames,
-            total=total,
-            desc=self.prefix + name,
-            unit="frame",
-            leave=False,
-            disable=not self.shown,
-        )

@@ -51,3 +51,19 @@ class PolicyPreset:
     cameras: tuple[str, ...] = CAMERAS
     image_size: tuple[int, int] = (480, 640)
     object_pose: bool = False
+
+
+WITHOUT_IMAGES = TrainSettings(
+    batch_size=64,
+    learning_rate=1e-3,
+    schedule="cosine",
+    warmup_steps=100,
+    sampler="frame",
+    steps=6000,
+    state_noise=0.2,
+    clock_noise=0.5,
+    validation_fraction=0.0,
+    ema_decay=0.999,
+)
+"""How policies are trained that see no images, in minutes on two cores; ``docs/act.md`` says what
+was tried."""

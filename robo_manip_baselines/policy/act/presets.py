@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from robo_manip_baselines.policy.act.config import ActConfig
-from robo_manip_baselines.policy.presets import Acting, PolicyPreset
+from robo_manip_baselines.policy.presets import WITHOUT_IMAGES, Acting, PolicyPreset
 from robo_manip_baselines.training.settings import TrainSettings
 
 PRESETS = {
@@ -30,18 +30,7 @@ PRESETS = {
             cvae_layers=1,
             dropout=0.0,
         ),
-        training=TrainSettings(
-            batch_size=64,
-            learning_rate=1e-3,
-            schedule="cosine",
-            warmup_steps=100,
-            sampler="frame",
-            steps=6000,
-            state_noise=0.2,
-            clock_noise=0.5,
-            validation_fraction=0.0,
-            ema_decay=0.999,
-        ),
+        training=WITHOUT_IMAGES,
         acting=Acting(temporal_ensemble=True),
         cameras=(),
         object_pose=True,

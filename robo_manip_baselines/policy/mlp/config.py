@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.presets import Acting, PolicyPreset
-from robo_manip_baselines.training.settings import TrainSettings
+from robo_manip_baselines.policy.presets import WITHOUT_IMAGES, Acting, PolicyPreset
 
 
 @dataclass(frozen=True)
@@ -39,18 +38,7 @@ class MlpConfig:
 PRESETS = {
     "cpu": PolicyPreset(
         config=MlpConfig(),
-        training=TrainSettings(
-            batch_size=256,
-            learning_rate=1e-3,
-            schedule="cosine",
-            warmup_steps=100,
-            sampler="frame",
-            steps=6000,
-            state_noise=0.2,
-            clock_noise=0.5,
-            validation_fraction=0.0,
-            ema_decay=0.999,
-        ),
+        training=replace(WITHOUT_IMAGES, batch_size=256),
         acting=Acting(temporal_ensemble=False, execute=10),
         cameras=(),
         object_pose=True,
