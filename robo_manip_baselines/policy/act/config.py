@@ -33,7 +33,7 @@ class ActConfig:
             the first; see ``paper_compat``).
         state_layers: hidden layers, as wide as ``feedforward_size``, of the perceptron that makes
             the token of the state (public ACT: 0, one linear layer). Without pictures that token
-            is all there is to see, and one linear layer is not enough: see ``docs/act.md``.
+            is all there is to see; ``docs/act.md`` says what hidden layers changed.
         latent_size: Z, numbers of the latent style variable (public ACT: 32).
         cvae_layers: of the Transformer over class token, state and actions that proposes the
             latent in training (public ACT: 4).
