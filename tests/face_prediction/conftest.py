@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -123,3 +125,15 @@ def _write_video(
 def write_video() -> Callable[..., Path]:
     """Encode RGB images as H.264, at given times, with a display rotation."""
     return _write_video
+
+
+@pytest.fixture
+def statsmodels() -> Callable[[str], Any]:
+    """Import a module of statsmodels, an independent implementation; its warnings are not ours."""
+
+    def module(name: str) -> Any:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return pytest.importorskip(f"statsmodels.{name}", reason="statsmodels is not installed")
+
+    return module
