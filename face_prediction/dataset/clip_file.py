@@ -17,8 +17,8 @@ import numpy as np
 from face_prediction.dataset.facts import FACTS
 from face_prediction.dataset.pictures import checksum
 from face_prediction.dataset.sequences import ClipFrames, Sequences
-from face_prediction.dataset.whole_file import whole_file
 from face_prediction.errors import RequestError
+from face_prediction.whole_file import whole_file
 
 SCHEMA = "face_dataset_clip"
 VERSION = 1

@@ -11,8 +11,8 @@ from typing import Any
 
 from face_prediction.dataset.facts import FACTS
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.dataset.whole_file import whole_file
 from face_prediction.errors import RequestError
+from face_prediction.whole_file import whole_file
 
 SCHEMA = "face_dataset"
 VERSION = 1

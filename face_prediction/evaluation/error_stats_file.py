@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 from face_prediction.errors import RequestError
 from face_prediction.evaluation.camera import Camera
 from face_prediction.evaluation.error_stats import ErrorStats, HorizonErrors, ResidualRun
+from face_prediction.whole_file import whole_file
 
 SCHEMA = "error_stats"
 VERSION = 1
@@ -31,24 +30,8 @@ def save_error_stats(path: Path, stats: ErrorStats) -> None:
     # numbers of one innermost list side by side: shorter, and readable. In JSON only the layout
     # has line breaks, so no text is touched.
     text = re.sub(r"\[\n\s*([-+0-9.eE,\s]+?)\n\s*\]", lambda m: f"[{' '.join(m[1].split())}]", text)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    except OSError as error:
-        raise RequestError(
-            f"{path.parent}: cannot be written ({error.strerror}); choose another folder"
-        ) from None
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.chmod(0o644)  # mkstemp makes files that only their owner may read
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with whole_file(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def load_error_stats(path: Path) -> ErrorStats:

@@ -255,7 +255,7 @@ def test_failed_write_leaves_the_old_file(
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("face_prediction.evaluation.error_stats_file.os.fsync", fail)
+    monkeypatch.setattr("face_prediction.whole_file.os.fsync", fail)
     with pytest.raises(OSError, match="disk full"):
         save_error_stats(path, replace(stats, predictor="other"))
     assert load_error_stats(path) == stats

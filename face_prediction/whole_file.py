@@ -17,15 +17,16 @@ def whole_file(path: Path) -> Iterator[Path]:
     The data are on the disk before the name is. A block that raises leaves nothing behind.
 
     Raises:
-        RequestError: the folder cannot be made.
+        RequestError: the folder cannot be made or written to.
     """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch()
     except OSError as error:
         raise RequestError(
             f"{path.parent}: cannot be written ({error.strerror}); choose another folder"
         ) from None
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield temporary
         descriptor = os.open(temporary, os.O_RDONLY)
