@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from robo_manip_baselines.envs.mujoco.face_env import CONTROL_PERIOD, world_of
 from robo_manip_baselines.envs.mujoco.registration import env_id
 from robo_manip_baselines.errors import RequestError, require_choice
+from robo_manip_baselines.evaluation.arm import arm_name, changed_name, choose_corruption
 from robo_manip_baselines.evaluation.result import EpisodeResult
 from robo_manip_baselines.evaluation.task import Task
 from robo_manip_baselines.expert.rollout_options import PolicyOptions, RolloutOptions
-from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.observation.options import parse_cameras, parse_image_size
 from robo_manip_baselines.opengl_check import opengl_problem
 from robo_manip_baselines.policy.checkpoint import Checkpoint, read_checkpoint
@@ -63,9 +63,15 @@ class Evaluation:
             else f"{acting.execute} actions of each chunk"
         )
         return (
-            f"{checkpoint.policy}, {arm_name(checkpoint.spec)}, step {checkpoint.step}, on "
+            f"{checkpoint.policy}, {self.arm}, step {checkpoint.step}, on "
             f"{self.device} in {self.precision}: {how}; seeds {self.seeds[0]} to {self.seeds[-1]}"
         )
+
+    @property
+    def arm(self) -> str:
+        """What the policy was trained with, and what it is shown here where that is another."""
+        trained = self.checkpoint.spec
+        return arm_name(trained) + changed_name(trained, self.task.spec)
 
     def seen_seeds(self) -> list[int]:
         """Return the seeds that the demonstrations were recorded with, training or validation."""
@@ -77,7 +83,7 @@ class Evaluation:
         return {
             "env": env_id(self.task.env),
             "env_kwargs": self.task.env_kwargs,
-            "observation": asdict(self.task.spec),
+            "observation": self.task.spec.to_json(),
             "xml_hash": self.checkpoint.xml_hash,
             "policy": self.checkpoint.policy,
             "checkpoint": self.checkpoint.content_hash,
@@ -90,7 +96,7 @@ class Evaluation:
         """Return what else to note beside results."""
         checkpoint = self.checkpoint
         return {
-            "arm": arm_name(checkpoint.spec),
+            "arm": self.arm,
             "checkpoint_folder": str(checkpoint.folder),
             "checkpoint_step": checkpoint.step,
             "train_seed": checkpoint.train_seed,
@@ -126,7 +132,9 @@ def plan(options: RolloutOptions) -> Evaluation:
     checkpoint = read_checkpoint(given.checkpoint)
     _refuse_contradictions(options, checkpoint)
     recorded = checkpoint.dataset.get("env_kwargs", {})
-    task = Task(checkpoint.env, checkpoint.spec, {**recorded, **options.motion_arguments()})
+    corruption = choose_corruption(checkpoint, options.detection, given.change_corruption)
+    spec = replace(checkpoint.spec, corruption=corruption)
+    task = Task(checkpoint.env, spec, {**recorded, **options.motion_arguments()})
     check_fit(checkpoint, task)
     if (checkpoint.spec.cameras or given.video) and (problem := opengl_problem()):
         why = "the policy sees images" if checkpoint.spec.cameras else "--video 0 needs no OpenGL"
@@ -136,7 +144,9 @@ def plan(options: RolloutOptions) -> Evaluation:
         task=task,
         acting=choose_acting(checkpoint.acting, given),
         seeds=options.seeds(FIRST_SEED),
-        out=options.out or Path("results") / f"{options.env}_{run_name(given.checkpoint)}",
+        out=options.out
+        or Path("results")
+        / f"{options.env}_{run_name(given.checkpoint)}{changed_name(checkpoint.spec, spec)}",
         num_envs=given.num_envs,
         workers=options.workers,
         device=choose_device(given.device),
@@ -193,7 +203,6 @@ def _refuse_contradictions(options: RolloutOptions, checkpoint: Checkpoint) -> N
         "environment": (options.env, checkpoint.env),
         "obs": (given.obs, spec.obs),
         "horizon": (given.horizon, spec.horizon),
-        "error": (given.error, spec.error),
         "object_pose": (given.object_pose or None, spec.object_pose),
         "cameras": (cameras, spec.cameras),
         "image_size": (
@@ -207,13 +216,6 @@ def _refuse_contradictions(options: RolloutOptions, checkpoint: Checkpoint) -> N
                 f"checkpoint '{checkpoint.folder}' was trained with {name} {_spelt(trained)}, not "
                 f"{_spelt(typed)}; leave the option as trained, or train another policy"
             )
-
-
-def arm_name(spec: ObservationSpec) -> str:
-    """Name the experimental arm: what a policy is shown, for example ``current_pred_h2``."""
-    horizon = f"_h{spec.horizon}" if spec.obs == "current_pred" else ""
-    error = f"_{spec.error}" if spec.error != "none" else ""
-    return f"{spec.obs}{horizon}{error}"
 
 
 def run_name(checkpoint: Path) -> str:
@@ -230,7 +232,7 @@ def stamp(result: EpisodeResult, evaluation: Evaluation) -> EpisodeResult:
     return replace(
         result,
         policy=checkpoint.policy,
-        arm=arm_name(checkpoint.spec),
+        arm=evaluation.arm,
         train_seed=checkpoint.train_seed,
         checkpoint=checkpoint.content_hash,
         versions=software(),

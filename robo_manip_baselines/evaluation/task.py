@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import gymnasium
@@ -58,8 +58,8 @@ class Task:
             "cameras": (),
             "image_size": spec.image_size,
             "object_pose": spec.object_pose,
-            "error": spec.error,
             "arms": spec.arms,
+            "corruption": spec.corruption and asdict(spec.corruption),
             **self.env_kwargs,
             **changes,
         }

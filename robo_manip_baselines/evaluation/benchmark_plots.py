@@ -1,0 +1,194 @@
+"""The plots of a benchmark.
+
+World frame seen from in front of the face: y to the right, z up; the person's left is on the right.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from robo_manip_baselines.envs.mujoco.feeding_success import MOUTH_TOLERANCE
+from robo_manip_baselines.evaluation.failure import FAILURES, REACH
+from robo_manip_baselines.evaluation.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    YELLOW,
+    Plot,
+    new_figure,
+)
+from robo_manip_baselines.evaluation.horizon_plots import delay_surface, success_by_horizon
+from robo_manip_baselines.evaluation.paper_results import PAPER
+from robo_manip_baselines.evaluation.statistics.study import ArmFigures, Study
+
+FACE_VIEW = 0.06
+"""m to every side of the mouth in the plot of arrivals."""
+
+MANY_POINTS = 3000
+"""More of them are drawn as pixels: as shapes they would make the file large."""
+
+FAILURE_COLOURS = dict(zip(FAILURES, (GREY, PINK, BLUE, SKY, RED, ORANGE, YELLOW), strict=True))
+
+
+def benchmark_plots(study: Study) -> tuple[Plot, ...]:
+    """Draw all plots for which there are arms.
+
+    Raises:
+        RequestError: matplotlib is not installed.
+    """
+    drawn = (
+        success_by_horizon(study),
+        completion_times(study),
+        arrivals(study),
+        failure_kinds(study),
+        delay_surface(study),
+    )
+    return tuple(plot for plot in drawn if plot)
+
+
+def completion_times(study: Study) -> Plot:
+    """Draw the times of successes, one row for each arm."""
+    name, title = "completion_times", "Completion times"
+    rng = np.random.default_rng(0)  # scatters points up and down, so that they can be told apart
+    arms = study.arms
+    many = sum(f.time.n for f in arms) > MANY_POINTS
+    with new_figure(name, 8.0, 0.9 + 0.34 * len(arms)) as (figure, stream):
+        axes = figure.add_subplot()
+        for row, figures in enumerate(arms):
+            times = figures.outcomes.time[np.isfinite(figures.outcomes.time)]
+            jitter = row + rng.uniform(-0.25, 0.25, times.size)
+            axes.plot(
+                times, jitter, ".", color=SKY, alpha=0.55, ms=4, mew=0, zorder=1, rasterized=many
+            )
+            time = figures.time
+            if time.low is not None and time.high is not None:
+                axes.plot([time.low, time.high], [row, row], color=INK, lw=2, zorder=3)
+            if time.mean is not None:
+                axes.plot(time.mean, row, "o", color=INK, ms=5, zorder=3)
+            if figures.arm.name in PAPER:
+                there = PAPER[figures.arm.name].completion_time
+                axes.plot(there, row, "D", mfc="none", mec=RED, ms=6, zorder=4)
+        _name_rows(axes, arms)
+        axes.set_xlabel("from the lift to success, s")
+        axes.grid(axis="x")
+    timed = [figures for figures in arms if figures.time.mean is not None]
+    fastest = min(timed, key=lambda f: f.time.mean or 0.0, default=None)
+    return Plot(
+        name,
+        title,
+        "Light dots: successful episodes. Dark: mean and 95 % interval (bootstrap). "
+        "Hollow diamonds: the paper's Table V.",
+        f"The shortest mean is that of {fastest.arm.label}, {fastest.time.mean:.2f} s."
+        if fastest
+        else "No episode succeeded.",
+        stream.getvalue(),
+    )
+
+
+def arrivals(study: Study) -> Plot:
+    """Draw where on the mouth's plane the gripper came nearest, one picture for each arm."""
+    name, title = "arrivals", "Where on the face the cube arrived"
+    columns = min(4, len(study.arms))
+    rows = -(-len(study.arms) // columns)
+    many = sum(len(f.lines) for f in study.arms) > MANY_POINTS
+    across, up = 1000.0 * MOUTH_TOLERANCE[1:]
+    view = 1000.0 * FACE_VIEW
+    with new_figure(name, 2.2 * columns, 2.45 * rows + 0.3) as (figure, stream):
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for axes in grid.flat[len(study.arms) :]:
+            axes.set_axis_off()
+        for axes, figures in zip(grid.flat, study.arms, strict=False):
+            results = [line.result for line in figures.lines]
+            at_face = [
+                (1000.0 * r.closest_offset[1], 1000.0 * r.closest_offset[2], r.is_success)
+                for r in results
+                if r.closest_offset is not None and abs(r.closest_offset[0]) < REACH
+            ]
+            seen = [p for p in at_face if max(abs(p[0]), abs(p[1])) <= view]
+            for is_success, colour, marker in ((False, RED, "x"), (True, GREEN, ".")):
+                points = np.array([p[:2] for p in seen if p[2] == is_success]).reshape(-1, 2)
+                axes.plot(
+                    *points.T, marker, color=colour, ms=3.5, mew=0.7, alpha=0.7, rasterized=many
+                )
+            axes.plot(
+                [-across, across, across, -across, -across],
+                [-up, -up, up, up, -up],
+                color=INK,
+                lw=1.2,
+            )
+            axes.set_title(_two_lines(figures.arm.label), fontsize=9)
+            missing = f"{len(results) - len(at_face)} not at the face"
+            if outside := len(at_face) - len(seen):
+                missing += f", {outside} outside"
+            axes.text(0.02, 0.02, missing, transform=axes.transAxes, fontsize=7)
+            axes.set(xlim=(-view, view), ylim=(-view, view), aspect="equal")
+        figure.supxlabel("across the face, mm (right: the person's left)", fontsize=10)
+        figure.supylabel("up, mm", fontsize=10)
+    return Plot(
+        name,
+        title,
+        "The gripper with the cube, relative to the mouth, at its closest approach (nearest in "
+        f"units of the tolerances), where that was within {1000 * REACH:.0f} mm along the face's "
+        "normal. Green dots: successes; red crosses: failures; the box: tolerance of "
+        f"±{across:.0f} mm.",
+        "One scatter plot for each arm; the numbers are in the table of how episodes ended.",
+        stream.getvalue(),
+    )
+
+
+def failure_kinds(study: Study) -> Plot:
+    """Draw the share of every kind of failure, one bar for each arm."""
+    name, title = "failures", "How episodes ended"
+    kinds = {"": GREEN, **FAILURE_COLOURS}
+    with new_figure(name, 8.0, 1.3 + 0.34 * len(study.arms)) as (figure, stream):
+        axes = figure.add_subplot()
+        left = np.zeros(len(study.arms))
+        for kind, colour in kinds.items():
+            shares = np.array(
+                [
+                    100.0 * Counter(line.result.failure for line in f.lines)[kind] / len(f.lines)
+                    for f in study.arms
+                ]
+            )
+            label = kind.replace("_", " ") or "success"
+            rows = range(len(study.arms))
+            axes.barh(rows, shares, left=left, color=colour, height=0.75, label=label)
+            left += shares
+        _name_rows(axes, study.arms)
+        axes.set(xlim=(0.0, 100.0), xlabel="share of episodes, %")
+        figure.legend(loc="outside lower center", ncols=4, fontsize=9)
+    counts = Counter(line.result.failure for f in study.arms for line in f.lines)
+    del counts[""]
+    most = counts.most_common(1)
+    return Plot(
+        name,
+        title,
+        "Kinds of failure as defined in the table.",
+        f"The most frequent failure of all arms is {most[0][0].replace('_', ' ')}, "
+        f"{most[0][1]} episodes."
+        if most
+        else "No episode failed.",
+        stream.getvalue(),
+    )
+
+
+def _name_rows(axes: Any, arms: Sequence[ArmFigures]) -> None:
+    """Name the rows of a plot after arms, the first one on top."""
+    axes.set_yticks(range(len(arms)), [f.arm.label for f in arms])
+    axes.set_ylim(len(arms) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+
+
+def _two_lines(label: str) -> str:
+    """Break a long label at its first comma."""
+    head, comma, tail = label.partition(", ")
+    return f"{head}\n{tail}" if comma and len(label) > 18 else label

@@ -1,0 +1,1 @@
+"""``report.html``: a benchmark on one page, see ``docs/benchmark_report.md``."""

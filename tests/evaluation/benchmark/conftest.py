@@ -1,0 +1,118 @@
+"""Made-up result lines of a whole benchmark: sixteen arms, two training seeds, 100 episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robo_manip_baselines.evaluation.failure import failure_kind
+from robo_manip_baselines.evaluation.result import EpisodeResult
+from robo_manip_baselines.evaluation.statistics.lines import Line, read_lines
+from robo_manip_baselines.evaluation.statistics.study import Study, analyse
+
+ARMS = {
+    "baseline": 0.42,
+    "current": 0.60,
+    **{f"current_pred_h{h}": p for h, p in enumerate((0.66, 0.74, 0.72, 0.68, 0.60), start=1)},
+    **{
+        f"current_pred_h{h}_uniform": p for h, p in enumerate((0.6, 0.72, 0.7, 0.62, 0.54), start=1)
+    },
+    "current_pred_h2_model": 0.70,
+    "current_pred_h2_delay3": 0.55,
+    "current_delay3": 0.45,
+    "shuffled_future": 0.40,
+}
+"""Name -> chance of success."""
+
+MakeLines = Callable[..., tuple[Line, ...]]
+
+
+def make_results(
+    arms: Sequence[str] = tuple(ARMS), train_seeds: int = 2, episodes: int = 100, seed: int = 0
+) -> list[EpisodeResult]:
+    """Draw results; easy seeds are easy for all arms, and training runs differ."""
+    rng = np.random.default_rng(seed)
+    ease = rng.normal(0.0, 1.0, episodes)
+    results = []
+    for arm in arms:
+        chance = ARMS[arm]
+        for train_seed in range(train_seeds):
+            luck = rng.normal(0.0, 0.3)
+            for episode in range(episodes):
+                logit = np.log(chance / (1.0 - chance)) + 1.2 * ease[episode] + luck
+                is_success = bool(rng.random() < 1.0 / (1.0 + np.exp(-logit)))
+                if is_success:
+                    offset = (0.02, *rng.uniform(-0.0099, 0.0099, 2))
+                else:
+                    far = rng.random() < 0.15
+                    angle, radius = rng.uniform(0, 2 * np.pi), 0.015 + rng.exponential(0.012)
+                    offset = (
+                        0.1 if far else 0.02,
+                        1.5 * radius * np.cos(angle),
+                        1.5 * radius * np.sin(angle),
+                    )
+                was_grasped = is_success or rng.random() > 0.1
+                x, y, z = map(float, offset)
+                offset = (x, y, z) if was_grasped else None
+                time = round(float(rng.normal(4.2 + 0.3 * (1.0 - chance), 0.9)) / 0.02) * 0.02
+                results.append(
+                    EpisodeResult(
+                        env="FeedingEnv",
+                        seed=1000 + episode,
+                        is_success=is_success,
+                        is_success_strict=is_success and bool(rng.random() < 0.5),
+                        completion_time=round(time, 6) if is_success else None,
+                        time_since_lift=8.0 if was_grasped else None,
+                        steps=600,
+                        failure=failure_kind(
+                            is_success=is_success,
+                            was_released=bool(rng.random() < 0.3),
+                            closest_offset=offset,
+                        ),
+                        closest_distance=float(np.linalg.norm(offset)) if offset else None,
+                        closest_offset=offset,
+                        face_force=0.0,
+                        motion_clip=f"clip_{episode % 7}",
+                        motion_subject=f"person {episode % 5}",
+                        policy="Act",
+                        arm=arm,
+                        train_seed=train_seed,
+                        checkpoint="ab" * 32,
+                        versions={"numpy": "2"},
+                    )
+                )
+    return results
+
+
+def write_results(path: Path, results: Sequence[EpisodeResult]) -> Path:
+    """Write lines as an evaluation does."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"{result.to_line()}\n" for result in results), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="session")
+def make_lines(tmp_path_factory: pytest.TempPathFactory) -> MakeLines:
+    """Draw results, see ``make_results``, write them to a file and read them."""
+
+    def make(**changes: object) -> tuple[Line, ...]:
+        folder = tmp_path_factory.mktemp("results")
+        path = write_results(folder / "results.jsonl", make_results(**changes))  # type: ignore[arg-type]
+        return read_lines([path], root=folder)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def lines(make_lines: MakeLines) -> tuple[Line, ...]:
+    """The whole benchmark."""
+    return make_lines()
+
+
+@pytest.fixture(scope="session")
+def study(lines: tuple[Line, ...]) -> Study:
+    """Figures of the whole benchmark, with few resamples."""
+    return analyse(lines, resamples=500)

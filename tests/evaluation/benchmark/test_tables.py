@@ -1,0 +1,169 @@
+"""One table, three formats; and what stands in the tables of a benchmark."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from robo_manip_baselines.evaluation.cells import later, p_cell, percent, points, seconds
+from robo_manip_baselines.evaluation.failure import FAILURES
+from robo_manip_baselines.evaluation.paper_results import PAPER
+from robo_manip_baselines.evaluation.statistics.lines import Line, Selection
+from robo_manip_baselines.evaluation.statistics.study import Study, analyse
+from robo_manip_baselines.evaluation.study_tables import study_tables
+from robo_manip_baselines.evaluation.tables import (
+    Cell,
+    Column,
+    Row,
+    Table,
+    to_csv,
+    to_latex,
+    to_markdown,
+    write_tables,
+)
+
+SMALL = Table(
+    "small",
+    "50 % of a_b | c",
+    (Column("Name", ("name",), is_text=True), Column("Rate & more", ("rate", "is_good"))),
+    (
+        Row("one", (Cell("a_1 | <b>", ("a_1",)), Cell("−3.5 ± 1", (-0.035, True), is_strong=True))),
+        Row("two", (Cell("50% {x}\\y~^", ("q",)), Cell("–", (None, False)))),
+        Row("two", (Cell("“c” $ #", ("c",)), Cell("2 × 3 > 5", (1 / 3, False)))),
+    ),
+    notes=("A note_1.", "Another."),
+)
+
+
+def test_markdown() -> None:
+    assert to_markdown(SMALL) == (
+        "**50 % of a\\_b \\| c**\n"
+        "\n"
+        "| Name | Rate & more |\n"
+        "| --- | --: |\n"
+        "| a\\_1 \\| \\<b\\> | **−3.5 ± 1** |\n"
+        "| 50% {x}\\\\y~^ | – |\n"
+        "| “c” $ # | 2 × 3 \\> 5 |\n"
+        "\n"
+        "A note\\_1. Another.\n"
+    )
+
+
+def test_csv_has_every_value_in_full() -> None:
+    rows = list(csv.DictReader(io.StringIO(to_csv(SMALL))))
+    assert rows[0] == {"group": "one", "name": "a_1", "rate": "-0.035", "is_good": "true"}
+    assert rows[1] == {"group": "two", "name": "q", "rate": "", "is_good": "false"}
+    assert float(rows[2]["rate"]) == 1 / 3
+
+
+def test_latex() -> None:
+    text = to_latex(SMALL)
+    body = text.partition(r"\toprule")[2].partition(r"\bottomrule")[0].strip().splitlines()
+    assert body == [
+        r"Name & Rate \& more \\",
+        r"\midrule",
+        r"a\_1 | \textless{}b\textgreater{} & \textbf{$-$3.5 $\pm$ 1} \\",
+        r"\addlinespace",
+        r"50\% \{x\}\textbackslash{}y\textasciitilde{}\textasciicircum{} & -- \\",
+        r"``c'' \$ \# & 2 $\times$ 3 \textgreater{} 5 \\",
+    ]
+    assert r"\caption{50 \% of a\_b | c}" in text
+    assert r"\begin{tabular}{lr}" in text
+    assert r"\label{tab:small}" in text
+    assert text.endswith("% A note_1.\n% Another.\n")
+
+
+def test_a_table_with_a_hole_is_refused() -> None:
+    row = SMALL.rows[0]
+    with pytest.raises(ValueError, match="argument 2 is shorter"):
+        replace(SMALL, rows=(replace(row, cells=row.cells[:1]),))
+    with pytest.raises(ValueError, match="has not the values rate, is_good"):
+        replace(SMALL, rows=(replace(row, cells=(row.cells[0], Cell("1", (1,)))),))
+
+
+def test_figures_are_spelt_alike() -> None:
+    assert [percent(x) for x in (0.74, 1.0, None)] == ["74.0 %", "100.0 %", "–"]
+    assert [points(x) for x in (0.04, -0.125, -0.0001, 0.0)] == ["+4.0", "−12.5", "0.0", "0.0"]
+    assert [later(x) for x in (0.25, -0.25, -0.001, None)] == ["+0.25", "−0.25", "0.00", "–"]
+    assert seconds(4.305) == "4.30"
+    own = Selection("a")
+    assert [p_cell(p, own).text for p in (0.0004, 0.0496, None)] == ["< 0.001", "0.050", "–"]
+    assert [p_cell(p, own, is_strong=True).is_strong for p in (0.049, 0.05, None)] == [
+        True,
+        False,
+        False,
+    ]
+
+
+@pytest.mark.long
+def test_written_whole_in_three_formats(tmp_path: Path, study: Study) -> None:
+    tables = study_tables(study)
+    paths = write_tables(tmp_path / "tables", tables)
+    assert {path.suffix for path in paths} == {".md", ".csv", ".tex"}
+    assert len(set(paths)) == 3 * len(tables) == 24
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        assert text.endswith("\n")
+        assert "None" not in text
+        assert "nan" not in text
+        if path.suffix == ".tex":
+            body = text.partition("\n%")[0]
+            assert body.count("{") == body.count("}")
+            # What is not ASCII by now would stop pdfLaTeX.
+            assert body.isascii(), re.findall(r"[^\x00-\x7f]", body)
+
+
+def rows_of(tables: tuple[Table, ...], name: str) -> dict[str, dict[str, str]]:
+    (table,) = (table for table in tables if table.name == name)
+    rows = csv.DictReader(io.StringIO(to_csv(table)))
+    return {next(v for k, v in row.items() if k != "group"): row for row in rows}
+
+
+@pytest.mark.long
+def test_rows_of_the_benchmark(study: Study) -> None:
+    tables = study_tables(study)
+    arms = [figures.arm.name for figures in study.arms]
+    assert list(rows_of(tables, "success")) == arms
+    assert list(rows_of(tables, "completion_times")) == arms
+    assert list(rows_of(tables, "failures")) == arms
+    assert list(rows_of(tables, "success_differences")) == [a for a in arms if a != "current"]
+    assert list(rows_of(tables, "success_beside_paper")) == [a for a in arms if a in PAPER]
+    assert list(rows_of(tables, "completion_times_beside_paper")) == [a for a in arms if a in PAPER]
+    assert len(rows_of(tables, "findings")) == 5
+
+    figures = study.arms[0]
+    row = rows_of(tables, "success")["baseline"]
+    assert int(row["episodes"]) == 200
+    assert float(row["success"]) == figures.success.rate
+    assert (float(row["low"]), float(row["high"])) == (figures.success.low, figures.success.high)
+    assert float(row["strict_high"]) == figures.strict.high
+    runs = rows_of(tables, "success_by_training_seed")["baseline"]
+    for seed, part in figures.success_by_seed.items():
+        assert float(runs[f"seed_{seed}"]) == part.rate
+        assert float(runs[f"seed_{seed}_low"]) == part.low
+    rates = [part.rate or 0.0 for part in figures.success_by_seed.values()]
+    assert float(runs["range"]) == pytest.approx(abs(rates[0] - rates[1]))
+    ends = rows_of(tables, "failures")["baseline"]
+    assert int(ends["success"]) + sum(int(ends[kind]) for kind in FAILURES) == 200
+    beside = rows_of(tables, "success_beside_paper")["current_pred_h2"]
+    assert beside["paper_success"] == "0.74"
+    assert beside["is_compatible"] in ("true", "false")
+
+
+@pytest.mark.long
+def test_one_training_seed_has_no_columns_for_several(
+    make_lines: Callable[..., tuple[Line, ...]],
+) -> None:
+    lines = make_lines(arms=["shuffled_future"], train_seeds=1, episodes=6)
+    tables = study_tables(analyse(lines, resamples=50))
+    # Nothing to compare with: neither another arm, nor the paper, nor a finding.
+    assert [table.name for table in tables] == ["success", "completion_times", "failures"]
+    assert "by_training_seed" not in to_csv(tables[1])
+    assert "bootstrap" not in to_markdown(tables[0])
+    assert to_markdown(tables[0]).count("**") == 4  # the title, and the best of one
