@@ -75,7 +75,7 @@ def content_digest(
     """SHA-256 over everything an episode says, whatever the library that laid out the file.
 
     Args:
-        arrays: every field of the table.
+        arrays: every field of the table that the episode has.
         checksums: camera -> (T,) uint32, the CRC-32 of its encoded frames.
         attributes: every attribute as `loaded_attribute` gives it; ``content_sha256`` is skipped.
 
@@ -84,7 +84,9 @@ def content_digest(
     """
     digest = hashlib.sha256()
     for field in FIELDS:
-        _add_array(digest, field.name, np.asarray(arrays[field.name]).astype(field.dtype))
+        if field.name in arrays:
+            array = np.asarray(arrays[field.name]).astype(field.dtype)
+            _add_array(digest, field.name, array)
     for camera in sorted(checksums):
         _add_array(digest, camera, np.asarray(checksums[camera], dtype=np.uint32))
     for item in ATTRIBUTES:

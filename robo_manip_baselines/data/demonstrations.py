@@ -21,6 +21,7 @@ from robo_manip_baselines.data.episode import EpisodeReader, read_metadata
 from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_episodes, seed_of
 from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec, observe
+from robo_manip_baselines.observation.detector import NO_PREDICTION, Detector
 from robo_manip_baselines.observation.recorded import recorded_truth
 from robo_manip_baselines.observation.vector import to_vector
 
@@ -34,8 +35,9 @@ SHARED = (
 )
 """Attributes that episodes must share for one policy to learn from them."""
 
-_SHOWN = {field.name for field in fields(ObservationSpec)}
-"""Arguments of an environment that say what it shows; files hold truth, whatever was shown."""
+_SHOWN = {field.name for field in fields(ObservationSpec)} | {"error"}
+"""Arguments of an environment that say what it shows (``error``: in older files); files hold truth,
+whatever was shown."""
 
 
 @dataclass(frozen=True)
@@ -100,16 +102,21 @@ def load_demonstrations(
 
     Args:
         folder: as ``bin/Rollout.py`` writes it; ``failed/`` is left out.
-        spec: what to observe. An ``image_size`` smaller than the recorded one is met by shrinking
-            images as they are read; a larger one is refused, for it would add nothing.
+        spec: what to observe. Its corruption is applied to what is read, drawn from the seed of
+            each episode. An ``image_size`` smaller than the recorded one is met by shrinking images
+            as they are read; a larger one is refused, for it would add nothing.
         limit: read only so many episodes, those of the lowest seeds; all of them if None.
 
     Raises:
         RequestError: no such folder, no or not enough episodes in it, episodes that do not belong
-            together, or something in ``spec`` that they do not hold. Says what to do.
+            together, something in ``spec`` that they do not hold, or error statistics that cannot
+            be used. Says what to do.
         EpisodeFileError: a file is damaged.
     """
     folder = Path(folder)
+    # With the digest of the statistics, so that a policy is evaluated with those it learnt from.
+    spec = replace(spec, corruption=spec.corruption and spec.corruption.pinned())
+    detector = Detector.of(spec)
     paths = _episode_paths(folder, spec, limit)
     states: list[NDArray[np.float32]] = []
     actions: list[NDArray[np.float32]] = []
@@ -119,7 +126,10 @@ def load_demonstrations(
             attributes.append(episode.attributes)
             _require_same(paths[0], attributes[0], path, attributes[-1])
             _require_spec(path, attributes[-1], spec)
-            states.append(to_vector(spec, observe(spec, recorded_truth(episode))))
+            truth, report = recorded_truth(episode), None
+            if detector:
+                report = detector.report_episode(truth, attributes[-1]["seed"])
+            states.append(to_vector(spec, observe(spec, truth, report)))
             actions.append(episode.array("action").astype(np.float32))
     lengths = np.array([len(action) for action in actions], dtype=np.int64)
     hashes = "\n".join(item["content_sha256"] for item in attributes)
@@ -200,6 +210,8 @@ def _require_spec(path: Path, attributes: Mapping[str, Any], spec: ObservationSp
             f"'{path}' was recorded with the arms {', '.join(arms)}; arms '{spec.arms}' needs "
             f"{', '.join(spec.arm_names)}"
         )
+    if spec.corruption and spec.corruption.error == "model" and attributes["schema_version"] < 2:
+        raise RequestError(f"'{path}' holds {NO_PREDICTION}")
     recorded = attributes["cameras"]
     there = ", ".join(recorded) or "none"
     # Beside, for episodes with other images do not belong into the same folder.

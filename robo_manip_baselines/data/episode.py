@@ -15,10 +15,10 @@ from robo_manip_baselines.data.images import decode_image, image_checksum
 from robo_manip_baselines.data.schema import (
     ATTRIBUTES,
     FIELD_BY_NAME,
-    FIELDS,
     IMAGE_GROUP,
+    READABLE_VERSIONS,
     SCHEMA,
-    SCHEMA_VERSION,
+    fields_of,
 )
 from robo_manip_baselines.errors import RequestError, require_choice
 
@@ -90,9 +90,14 @@ class EpisodeReader:
         return tuple(self.attributes["cameras"])
 
     @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields of the table that a file of its schema version holds."""
+        return fields_of(self.attributes["schema_version"])
+
+    @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Every field of the table, read from the file at each call."""
-        return {field.name: self.array(field.name) for field in FIELDS}
+        """Every field that the file holds, read from the file at each call."""
+        return {name: self.array(name) for name in self.fields}
 
     def array(self, name: str) -> np.ndarray:
         """One field, all steps.
@@ -196,9 +201,10 @@ def require_schema(path: Path, file: h5py.File) -> None:
     schema = schema.decode(errors="replace") if isinstance(schema, bytes) else schema
     if schema != SCHEMA:
         raise EpisodeFileError(f"'{path}' is no episode: schema {schema!r}, not '{SCHEMA}'")
-    if version != SCHEMA_VERSION:
+    if version not in READABLE_VERSIONS:
         raise EpisodeFileError(
-            f"'{path}' has schema version {version}; this release reads {SCHEMA_VERSION}"
+            f"'{path}' has schema version {version}; this release reads "
+            f"{', '.join(map(str, READABLE_VERSIONS))}"
         )
 
 

@@ -25,7 +25,8 @@ from robo_manip_baselines.data.schema import (
     FIELDS,
     IMAGE_GROUP,
     SCHEMA,
-    SCHEMA_VERSION,
+    fields_of,
+    version_of,
 )
 from robo_manip_baselines.errors import require_choice
 
@@ -50,7 +51,8 @@ def write_episode(
 
     Args:
         path: file to write, see `files.episode_path`. Replaced if it is there.
-        arrays: every field of `schema.FIELDS`; float32 is widened.
+        arrays: every field of `schema.FIELDS`, those that are not in every schema version
+            where they are known; float32 is widened.
         images: camera -> T frames, each from `images.encode_image` with the codec that
             ``attributes["image_codec"]`` names. Empty without cameras.
         attributes: every attribute of `schema.ATTRIBUTES` that is not derived.
@@ -68,7 +70,9 @@ def write_episode(
         camera: np.array([image_checksum(frame) for frame in frames], dtype=np.uint32)
         for camera, frames in sorted(images.items())
     }
-    stored, loaded = _checked_attributes(attributes, images, len(fields["time"]))
+    stored, loaded = _checked_attributes(
+        attributes, images, len(fields["time"]), version_of(fields)
+    )
     problems = episode_consistency(loaded, fields)
     problems += value_problems(
         FIELD_BY_NAME["phase"], np.asarray(arrays["phase"]), len(loaded["phase_names"])
@@ -83,6 +87,8 @@ def write_episode(
         for item in ATTRIBUTES:
             file.attrs[item.name] = stored[item.name]
         for field in FIELDS:
+            if field.name not in fields:
+                continue
             _write_array(file, field.name, fields[field.name])
             for name in ("unit", "frame", "description"):
                 file[field.name].attrs[name] = stored_text(getattr(field, name))
@@ -94,7 +100,7 @@ def write_episode(
 
 def _checked_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     values = {name: np.asarray(array) for name, array in arrays.items()}
-    problems = [f"'{name}' is missing" for name in FIELD_BY_NAME if name not in values]
+    problems = [f"'{name}' is missing" for name in fields_of(1) if name not in values]
     problems += [f"'{name}' is no field" for name in values if name not in FIELD_BY_NAME]
     problems += shape_problems({name: value.shape for name, value in values.items()})
     for field in FIELDS:
@@ -104,15 +110,15 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             given = values[field.name].dtype
             problems.append(f"'{field.name}' is {given}, not {field.dtype}")
     if not problems:
-        for field in FIELDS:
-            problems += value_problems(field, values[field.name], None)
+        for name, value in values.items():
+            problems += value_problems(FIELD_BY_NAME[name], value, None)
     if problems:
         raise ValueError(f"these arrays are no episode: {'; '.join(problems)}")
-    return {field.name: values[field.name].astype(field.dtype) for field in FIELDS}
+    return {name: value.astype(FIELD_BY_NAME[name].dtype) for name, value in values.items()}
 
 
 def _checked_attributes(
-    attributes: Mapping[str, Any], images: EncodedImages, num_steps: int
+    attributes: Mapping[str, Any], images: EncodedImages, num_steps: int, version: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Both forms of all attributes: as HDF5 keeps them, and as they are read back."""
     given = {item.name for item in ATTRIBUTES if not item.derived}
@@ -124,7 +130,7 @@ def _checked_attributes(
     values: dict[str, Any] = {
         **attributes,
         "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": version,
         "content_sha256": "",
         "num_steps": num_steps,
         "cameras": sorted(images),

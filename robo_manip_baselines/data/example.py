@@ -7,15 +7,25 @@ from typing import Any
 import numpy as np
 
 from robo_manip_baselines.data.images import encode_image
-from robo_manip_baselines.data.schema import FIELDS
+from robo_manip_baselines.data.schema import FIELDS, fields_of
 
 
-def make_arrays(steps: int = 12, seed: int = 0, *, arms: int = 1) -> dict[str, np.ndarray]:
-    """Every field of the table, filled with finite numbers that obey its rules."""
+def make_arrays(
+    steps: int = 12, seed: int = 0, *, arms: int = 1, version: int = 1
+) -> dict[str, np.ndarray]:
+    """Every field of the table, filled with finite numbers that obey its rules.
+
+    Args:
+        steps: T.
+        seed: of the numbers.
+        arms: 1 or 2.
+        version: of the schema.
+    """
     rng = np.random.default_rng(seed)
     sizes = {"T": steps, "A": 7 * arms, "J": 6 * arms, "G": arms, "Q": 23, "V": 22}
     arrays: dict[str, np.ndarray] = {}
-    for field in FIELDS:
+    # By version, so that the numbers of the older fields are those of an older file.
+    for field in sorted(FIELDS, key=lambda field: field.since):
         shape = tuple(sizes[size] if isinstance(size, str) else size for size in field.shape)
         values = rng.normal(size=shape)
         if field.rule == "unit quaternion":
@@ -29,7 +39,7 @@ def make_arrays(steps: int = 12, seed: int = 0, *, arms: int = 1) -> dict[str, n
         if field.dtype == "bool":
             values = values > 0
         arrays[field.name] = values.astype(field.dtype)
-    return arrays
+    return {name: arrays[name] for name in fields_of(version)}
 
 
 def make_frames(steps: int = 12, seed: int = 0, size: tuple[int, int] = (24, 32)) -> np.ndarray:
@@ -60,7 +70,7 @@ def make_attributes(seed: int = 3, *, codec: str = "jpeg", arms: int = 1) -> dic
     joints = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
     return {
         "env_id": "robo_manip_baselines/FeedingEnv-v0",
-        "env_kwargs": {"cameras": ["top", "front_close"], "error": "none"},
+        "env_kwargs": {"cameras": ["top", "front_close"], "obs": "baseline"},
         "seed": seed,
         "expert": "reactive",
         "is_success": True,

@@ -66,7 +66,7 @@ def verify_file(path: str | Path, *, images: bool = True) -> list[Problem]:
 
 def _file_problems(path: Path, file: h5py.File, images: bool) -> list[Problem]:
     attributes, messages = readable_attributes(file)
-    arrays, found = _arrays(file)
+    arrays, found = _arrays(file, attributes.get("schema_version", 1))
     messages += found
     shapes = {name: array.shape for name, array in arrays.items()}
     wrong_shapes = shape_problems(shapes)
@@ -113,11 +113,13 @@ def readable_attributes(file: h5py.File) -> tuple[dict[str, Any], list[str]]:
     return attributes, problems
 
 
-def _arrays(file: h5py.File) -> tuple[dict[str, np.ndarray], list[str]]:
+def _arrays(file: h5py.File, version: int) -> tuple[dict[str, np.ndarray], list[str]]:
     arrays: dict[str, np.ndarray] = {}
     problems: list[str] = []
     for field in FIELDS:
         dataset = file.get(field.name)
+        if dataset is None and field.since > version:
+            continue
         if not isinstance(dataset, h5py.Dataset):
             problems.append(f"'{field.name}' is missing")
         elif dataset.dtype != np.dtype(field.dtype):

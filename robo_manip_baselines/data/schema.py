@@ -7,12 +7,14 @@ right.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 SCHEMA = "robo_manip_baselines/episode"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+READABLE_VERSIONS = (1, 2)
+"""A file says the lowest that describes it, so that one without newer fields stays the same."""
 
 # A group for each camera: `data`, the pictures one after another; `offset` (T + 1,), where each
 # begins; `checksum` (T,), the CRC-32 of each. HDF5's own type for rows of varying length is not
@@ -45,6 +47,7 @@ class Field:
     frame: str
     description: str
     rule: Rule = ""
+    since: int = 1  # schema version; not in files of a lower one
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,16 @@ FIELDS: tuple[Field, ...] = (
         "m",
         "world",
         "True mouth centre now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
+    ),
+    Field(
+        "predicted_mouth",
+        ("T", 5, 3),
+        "float64",
+        "m",
+        "world",
+        "Mouth centre k = 1…5 frames ahead as a trained predictor foretold it, its last error held "
+        "between video frames: x, y, z; only where the recorded motion came with predictions",
+        since=2,
     ),
     Field(
         "head_orientation",
@@ -200,6 +213,16 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     ),
 )
 ATTRIBUTE_BY_NAME: Mapping[str, Attribute] = {item.name: item for item in ATTRIBUTES}
+
+
+def version_of(fields: Iterable[str]) -> int:
+    """Return the schema version of a file with these fields."""
+    return max([1, *(FIELD_BY_NAME[name].since for name in fields)])
+
+
+def fields_of(version: int) -> tuple[str, ...]:
+    """Return the names of the fields that files of a schema version hold."""
+    return tuple(field.name for field in FIELDS if field.since <= version)
 
 
 def shape_text(field: Field) -> str:

@@ -24,7 +24,6 @@ __all__ = ["Problem", "damage_summary", "verify_dataset", "verify_file"]
 
 # What a folder's episodes must share for one policy to learn from them.
 SHARED_ATTRIBUTES = (
-    "schema_version",
     "env_id",
     "env_kwargs",
     "xml_hash",

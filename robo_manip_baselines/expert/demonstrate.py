@@ -96,6 +96,7 @@ def _row(world: FeedingEnv) -> dict[str, Any]:
         "end_effector_position": truth.end_effector_position,
         "end_effector_orientation": world.gripper_orientation,
         "mouth_position": truth.mouth_position,
+        **({} if truth.predicted_mouth is None else {"predicted_mouth": truth.predicted_mouth}),
         "head_orientation": world.head_orientation,
         "jaw_opening": world.jaw_opening,
         "object_pose": world.object_pose,

@@ -9,6 +9,7 @@ import tyro
 
 from robo_manip_baselines.data.images import DEFAULT_QUALITY
 from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.observation.options import CorruptionOptions
 
 EXAMPLE = """python bin/Rollout.py FeedingEnv --scripted --num_episodes 50 --workers 2
 
@@ -51,10 +52,11 @@ class PolicyOptions:
     """What the policy is shown: the checkpoint says it, this is only checked against it."""
     horizon: int | None = None
     """Frames that it looks ahead; only checked."""
-    error: str | None = None
-    """What stands between the true and the observed mouth; only checked."""
     object_pose: bool = False
     """Whether it is shown where the cube is; only checked."""
+    change_corruption: bool = False
+    """Let --error, --delay, --face_dropout, --detector_rate and what belongs to them replace what
+    the policy was trained with; otherwise they are only checked."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,10 @@ class RolloutOptions:
         default_factory=ScriptedOptions
     )
     evaluation: tyro.conf.OmitArgPrefixes[PolicyOptions] = field(default_factory=PolicyOptions)
+    detection: tyro.conf.OmitArgPrefixes[CorruptionOptions] = field(
+        default_factory=CorruptionOptions
+    )
+    """Only with --policy: what stands between the true and the shown mouth."""
 
     def __post_init__(self) -> None:
         if self.scripted and self.policy is not None:
@@ -102,10 +108,11 @@ class RolloutOptions:
                 "nothing acts; say --scripted to let the scripted expert act, or "
                 "--policy Act --checkpoint runs/... to let a trained policy act"
             )
-        unused = self.evaluation if self.scripted else self.demonstration
-        if name := _first_difference(unused):
-            wanted = "--policy" if self.scripted else "--scripted"
-            raise RequestError(f"--{name} goes with {wanted}; leave it out")
+        unused = (self.evaluation, self.detection) if self.scripted else (self.demonstration,)
+        for options in unused:
+            if name := _first_difference(options):
+                wanted = "--policy" if self.scripted else "--scripted"
+                raise RequestError(f"--{name} goes with {wanted}; leave it out")
         if self.num_episodes < 1:
             raise RequestError(f"num_episodes {self.num_episodes}: must be 1 or more")
         if self.seed is not None and self.seed < 0:
@@ -126,8 +133,11 @@ class RolloutOptions:
         return {name: value for name, value in given.items() if value}
 
 
-def _first_difference(options: ScriptedOptions | PolicyOptions) -> str | None:
-    """Name the first option that is not at its default."""
+def _first_difference(options: ScriptedOptions | PolicyOptions | CorruptionOptions) -> str | None:
+    """Name the first option that is not at its default, as it is spelt."""
     defaults = type(options)()
-    names = (item.name for item in fields(options))
-    return next((n for n in names if getattr(options, n) != getattr(defaults, n)), None)
+    for name in (item.name for item in fields(options)):
+        value = getattr(options, name)
+        if value != getattr(defaults, name):
+            return f"no_{name}" if value is False else name
+    return None

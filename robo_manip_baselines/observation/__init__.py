@@ -1,8 +1,8 @@
 """What a policy is shown: which components, in which order, and how they are built from truth."""
 
-from robo_manip_baselines.observation.error import ERRORS
+from robo_manip_baselines.observation.corruption import ERRORS, Corruption
 from robo_manip_baselines.observation.spec import CAMERAS, MAX_HORIZON, PRESETS, ObservationSpec
-from robo_manip_baselines.observation.truth import FRAME_PERIOD, Truth, observe
+from robo_manip_baselines.observation.truth import FRAME_PERIOD, Report, Truth, observe
 
 __all__ = [
     "CAMERAS",
@@ -10,7 +10,9 @@ __all__ = [
     "FRAME_PERIOD",
     "MAX_HORIZON",
     "PRESETS",
+    "Corruption",
     "ObservationSpec",
+    "Report",
     "Truth",
     "observe",
 ]

@@ -27,4 +27,7 @@ def recorded_truth(episode: EpisodeReader) -> Truth:
         end_effector_position=episode.array("end_effector_position"),
         mouth_position=episode.array("mouth_position"),
         object_position=episode.array("object_pose")[:, :3],
+        predicted_mouth=(
+            episode.array("predicted_mouth") if "predicted_mouth" in episode.fields else None
+        ),
     )

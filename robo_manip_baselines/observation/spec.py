@@ -5,12 +5,13 @@ Legend: A arms (1 or 2), H horizon in frames of 1/30 s, C cameras.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from robo_manip_baselines.envs.mujoco.vx300s import ARM_JOINTS
 from robo_manip_baselines.errors import RequestError, require_choice
-from robo_manip_baselines.observation.error import ERRORS
+from robo_manip_baselines.observation.corruption import Corruption
 
 PRESETS = ("baseline", "current", "current_pred")
 """The paper's three observation groups (section IV.C)."""
@@ -38,8 +39,9 @@ class ObservationSpec:
         cameras: views to show, any of ``CAMERAS``, or none at all.
         image_size: (height, width) in pixels.
         object_pose: whether to show the position of the cube.
-        error: what stands between the true and the observed mouth.
         arms: which arms the robot's state speaks of.
+        corruption: what stands between the true and the shown mouth; None, and one that is off,
+            which becomes None, show the truth.
 
     Raises:
         RequestError: a value that is not valid.
@@ -50,12 +52,11 @@ class ObservationSpec:
     cameras: tuple[str, ...] = CAMERAS
     image_size: tuple[int, int] = (480, 640)
     object_pose: bool = False
-    error: str = "none"
     arms: str = "right"
+    corruption: Corruption | None = None
 
     def __post_init__(self) -> None:
         require_choice("observation preset", self.obs, PRESETS)
-        require_choice("error model", self.error, ERRORS)
         require_choice("arms", self.arms, ARMS)
         for camera in self.cameras:
             require_choice("camera", camera, CAMERAS)
@@ -69,6 +70,46 @@ class ObservationSpec:
             raise RequestError(
                 f"image size {self.image_size}: must be height and width, 1 to {MAX_IMAGE_SIZE}"
             )
+
+        if self.corruption and self.corruption.is_off:
+            object.__setattr__(self, "corruption", None)
+        if self.corruption:
+            self._require_something_to_corrupt(self.corruption)
+
+    def _require_something_to_corrupt(self, corruption: Corruption) -> None:
+        if not self.frames:
+            raise RequestError(
+                f"'{corruption.label}' corrupts the mouth, of which the observation preset "
+                f"'{self.obs}' shows nothing; leave it out, or choose current or current_pred"
+            )
+        if self.obs == "current" and corruption.error != "none":
+            raise RequestError(
+                f"the error '{corruption.error}' is one of forecasts, of which the observation "
+                "preset 'current' shows none; choose current_pred, or the error none (delay, "
+                "face_dropout and detector_rate go with 'current', too)"
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what JSON can hold; without a corruption as releases before there was one."""
+        values = asdict(self)
+        arms, corruption = values.pop("arms"), values.pop("corruption")
+        values |= {"error": self.corruption.error if self.corruption else "none", "arms": arms}
+        return values | {"corruption": corruption} if corruption else values
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> ObservationSpec:
+        """Return the spec that ``to_json`` was called on.
+
+        Raises:
+            RequestError: a value that is not valid.
+            TypeError: a name that is unknown.
+        """
+        given: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
+        }
+        corruption = given.pop("corruption", None)
+        given.pop("error", None)
+        return cls(**given, corruption=corruption and Corruption.of(corruption))
 
     @property
     def arm_names(self) -> tuple[str, ...]:

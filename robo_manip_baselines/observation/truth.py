@@ -1,4 +1,4 @@
-"""From what is true to what is observed: ``truth -> error -> components``, on any batch shape.
+"""From what is true, or was reported of it, to what is observed, on any batch shape.
 
 Legend: ... any leading shape (none in an environment, (T,) for an episode, (B, T) for a batch),
 A arms, K = 6 frames from now to the longest horizon.
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.observation.error import ERRORS
+from robo_manip_baselines.observation.corruption import FRAME_RATE
 from robo_manip_baselines.observation.spec import ObservationSpec
 
-FRAME_PERIOD = 1.0 / 30.0
+FRAME_PERIOD = 1.0 / FRAME_RATE
 """s between two frames of the recorded motion and of the prediction (paper, section IV.A)."""
 
 
@@ -31,6 +31,8 @@ class Truth:
         end_effector_position: (..., 3) m, gripper site of the right arm.
         mouth_position: (..., K, 3) m, now and 1 ... 5 frames ahead.
         object_position: (..., 3) m, centre of the cube.
+        predicted_mouth: (..., K - 1, 3) m, where a trained predictor says that the mouth will be
+            1 ... 5 frames ahead; None where the recorded motion comes without.
     """
 
     time: NDArray[np.float64]
@@ -41,18 +43,43 @@ class Truth:
     end_effector_position: NDArray[np.float64]
     mouth_position: NDArray[np.float64]
     object_position: NDArray[np.float64]
+    predicted_mouth: NDArray[np.float64] | None = None
 
 
-def observe(spec: ObservationSpec, truth: Truth) -> dict[str, NDArray[np.float32]]:
+@dataclass(frozen=True)
+class Report:
+    """What a detector says of the mouth. SI units, world frame.
+
+    Attributes:
+        time: (...) s since the start of the episode: when it was seen.
+        mouth: (..., K, 3) m, then and 1 ... 5 frames after that.
+    """
+
+    time: NDArray[np.float64]
+    mouth: NDArray[np.float64]
+
+
+def observe(
+    spec: ObservationSpec, truth: Truth, report: Report | None = None
+) -> dict[str, NDArray[np.float32]]:
     """Build every vector of an observation; images are added by whoever has them.
 
     Args:
         spec: what to show.
         truth: with any leading shape.
+        report: what a `Detector` says of the mouth, of the same leading shape; needed where the
+            spec has a corruption.
 
     Returns:
-        The vectors that ``spec.components()`` names, float32 of shape (..., n).
+        The vectors that ``spec.components()`` names, float32 of shape (..., n). The distances are
+        those from the gripper as it is now to the mouth as it was reported.
+
+    Raises:
+        ValueError: a report is there and should not be, or the other way round.
     """
+    if (report is None) != (spec.corruption is None):
+        raise ValueError("a report of the mouth goes with a corruption, and only with one")
+    told = report or Report(truth.time, truth.mouth_position)
     arms = np.concatenate(
         [
             truth.joint_position,
@@ -64,12 +91,12 @@ def observe(spec: ObservationSpec, truth: Truth) -> dict[str, NDArray[np.float32
     )
     parts = {"state": arms.reshape(*arms.shape[:-2], -1)}
     if spec.frames:
-        mouth = ERRORS[spec.error](truth.mouth_position[..., : spec.frames, :])
+        mouth = told.mouth[..., : spec.frames, :]
         distance = np.linalg.norm(mouth - truth.end_effector_position[..., None, :], axis=-1)
         if spec.obs == "current":
             parts["mouth"] = np.concatenate([mouth[..., 0, :], distance], axis=-1)
         else:
-            time = truth.time[..., None] + np.arange(spec.frames) * FRAME_PERIOD
+            time = told.time[..., None] + np.arange(spec.frames) * FRAME_PERIOD
             timed = np.concatenate([time[..., None], mouth], axis=-1)
             parts["prediction"] = np.concatenate(
                 [timed.reshape(*timed.shape[:-2], -1), distance], axis=-1

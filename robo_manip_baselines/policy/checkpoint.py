@@ -221,14 +221,18 @@ def _encode(checkpoint: Checkpoint) -> tuple[dict[str, Any], dict[str, Any]]:
     config["action_names"] = list(checkpoint.action_names)
     config["split"] = checkpoint.split.to_json()
     for name in _DATACLASSES:
-        config[name] = dataclasses.asdict(getattr(checkpoint, name))
+        value = getattr(checkpoint, name)
+        config[name] = value.to_json() if name == "spec" else dataclasses.asdict(value)
     return config, checkpoint.normalization.to_json()
 
 
 def _decode(config: dict[str, Any], stats: dict[str, Any]) -> dict[str, Any]:
     decoded: dict[str, Any] = {name: config[name] for name in (*_PLAIN, *_DICTS)}
     for name, kind in _DATACLASSES.items():
-        decoded[name] = kind(**_with_tuples(config[name]))
+        values = config[name]
+        decoded[name] = (
+            kind.from_json(values) if kind is ObservationSpec else kind(**_with_tuples(values))
+        )
     policy_config = load_part(policy_entry(config["policy"]).config)
     decoded["config"] = policy_config(**_with_tuples(config["config"]))
     decoded["action_names"] = tuple(config["action_names"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -15,7 +15,11 @@ from robo_manip_baselines.command import parse
 from robo_manip_baselines.envs.mujoco.registration import ENVS
 from robo_manip_baselines.errors import RequestError, require_choice
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.options import parse_cameras, parse_image_size
+from robo_manip_baselines.observation.options import (
+    CorruptionOptions,
+    parse_cameras,
+    parse_image_size,
+)
 from robo_manip_baselines.policy.presets import PolicyPreset
 from robo_manip_baselines.policy.registry import POLICIES, load_part, policy_entry
 from robo_manip_baselines.training.run_folder import CONFIG, read_config
@@ -47,7 +51,9 @@ class TrainOptions(Generic[Network]):
     """What is shown: baseline (the robot), current (mouth too), current_pred (its future too)."""
     horizon: int = 2
     """Frames of 1/30 s that current_pred looks ahead, 1 to 5."""
-    error: str = "none"
+    detection: tyro.conf.OmitArgPrefixes[CorruptionOptions] = field(
+        default_factory=CorruptionOptions
+    )
     """What stands between the true and the shown mouth."""
     env: str = "FeedingEnv"
     """Environment of the demonstrations."""
@@ -70,7 +76,8 @@ class TrainOptions(Generic[Network]):
     device: str = "auto"
     """auto, cpu, cuda or cuda:NUMBER."""
     out: Path | None = None
-    """Run folder; runs/<policy>_<obs>[_h<horizon>][_<error>]_<preset>_seed<seed> if not given."""
+    """Run folder; runs/<policy>_<obs>[_h<horizon>][_<corruption>]_<preset>_seed<seed> if not
+    given."""
     resume: bool = False
     """Go on with the run in the run folder."""
     config: Path | None = None
@@ -103,8 +110,8 @@ class TrainOptions(Generic[Network]):
             cameras=parse_cameras(self.cameras),
             image_size=parse_image_size(self.image_size),
             object_pose=self.object_pose,
-            error=self.error,
             arms=self.arms,
+            corruption=self.detection.apply(),
         )
 
     @property
@@ -114,7 +121,8 @@ class TrainOptions(Generic[Network]):
             return self.out
         parts = [self.policy.lower(), self.obs]
         parts += [f"h{self.horizon}"] if self.obs == "current_pred" else []
-        parts += [self.error] if self.error != "none" else []
+        corruption = self.spec.corruption
+        parts += [corruption.label] if corruption else []
         return Path("runs") / "_".join([*parts, self.preset, f"seed{self.seed}"])
 
     @property
@@ -125,12 +133,16 @@ class TrainOptions(Generic[Network]):
     def to_config(self) -> dict[str, Any]:
         """Return all options but those that say where and how to run, flat, for YAML."""
         values: dict[str, Any] = {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("network", "training"):
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            if item.name in ("network", "training"):
                 values |= dataclasses.asdict(value)
-            elif field.name not in _NOT_SAVED:
-                values[field.name] = value
+            elif item.name == "detection":
+                values |= {**dataclasses.asdict(value), "error": value.error or "none"}
+                if value.corruption:  # so that older runs, which do not say it, are the same
+                    values.pop("corruption")
+            elif item.name not in _NOT_SAVED:
+                values[item.name] = value
         return {name: _to_yaml(value) for name, value in values.items()}
 
 
@@ -214,7 +226,7 @@ def _apply_yaml(
     file: Path, values: Mapping[str, Any], defaults: TrainOptions[Any]
 ) -> TrainOptions[Any]:
     """Parse a file's values as if they had been typed, so that they are checked the same way."""
-    known = defaults.to_config()
+    known = [*defaults.to_config(), "corruption"]
     args = [defaults.policy]
     for name, value in values.items():
         if name not in known:

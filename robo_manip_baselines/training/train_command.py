@@ -105,6 +105,11 @@ def resume_point(options: TrainOptions[Any], job: Job) -> Checkpoint | None:
             f"the demonstrations in '{options.demonstrations}' are not the ones that '{run}' was "
             "trained on; give those with --dataset, or choose another --out"
         )
+    if checkpoint.spec != job.demonstrations.spec:
+        raise RequestError(
+            f"the error statistics are not the ones that '{run}' was trained with; give those with "
+            "--error_stats, or choose another --out"
+        )
     return checkpoint
 
 

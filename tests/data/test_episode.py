@@ -24,6 +24,7 @@ from robo_manip_baselines.data.example import (
     make_frames,
     make_images,
 )
+from robo_manip_baselines.data.file_check import verify_file
 from robo_manip_baselines.data.schema import ATTRIBUTES, FIELDS
 from robo_manip_baselines.errors import RequestError
 
@@ -48,6 +49,23 @@ def test_what_is_written_is_read(tmp_path: Path, codec: str, arms: int) -> None:
                 error = np.abs(frame.astype(int) - truth)
                 # JPEG at 90 smears the square's edge; channels swapped would be off by 30.
                 assert error.mean() < (6 if codec == "jpeg" else 1e-9)
+
+
+def test_predictions_are_there_or_not(tmp_path: Path) -> None:
+    old, new = (make_arrays(version=version) for version in (1, 2))
+    assert set(new) - set(old) == {"predicted_mouth"}
+    for version, arrays in ((1, old), (2, new)):
+        path = write_episode(tmp_path / f"{version}.hdf5", arrays, {}, make_attributes())
+        assert verify_file(path) == []
+        with EpisodeReader(path) as episode:
+            assert episode.attributes["schema_version"] == version
+            assert set(episode.fields) == set(episode.arrays) == set(arrays)
+            np.testing.assert_array_equal(episode.array("qvel"), old["qvel"])
+    with EpisodeReader(path) as episode:
+        np.testing.assert_array_equal(episode.array("predicted_mouth"), new["predicted_mouth"])
+    with h5py.File(path, "a") as file:
+        del file["predicted_mouth"]
+    assert [problem.message for problem in verify_file(path)] == ["'predicted_mouth' is missing"]
 
 
 def test_state_only_episode(tmp_path: Path) -> None:
@@ -159,6 +177,8 @@ def test_units_stand_beside_the_numbers(tmp_path: Path) -> None:
     path = write_episode(tmp_path / "a.hdf5", make_arrays(), {}, make_attributes())
     with h5py.File(path) as file:
         for field in FIELDS:
+            if field.since > 1:
+                continue
             assert file[field.name].attrs["unit"].decode() == field.unit
             assert file[field.name].attrs["frame"].decode() == field.frame
         assert file["mouth_position"].attrs["unit"] == b"m"
@@ -197,7 +217,7 @@ def _other_hdf5(path: Path) -> None:
 def _future(path: Path) -> None:
     write_episode(path, make_arrays(), {}, make_attributes())
     with h5py.File(path, "a") as file:
-        file.attrs["schema_version"] = np.int64(2)
+        file.attrs["schema_version"] = np.int64(3)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +229,7 @@ def _future(path: Path) -> None:
         (_empty, "is no HDF5 file"),
         (_truncated, "is no HDF5 file, or a damaged one: .*truncated"),
         (_other_hdf5, "is no episode: schema None"),
-        (_future, "schema version 2; this release reads 1"),
+        (_future, "schema version 3; this release reads 1, 2"),
     ],
 )
 def test_errors_name_the_file_and_why(tmp_path: Path, make: object, why: str) -> None:

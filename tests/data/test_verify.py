@@ -23,7 +23,7 @@ from robo_manip_baselines.data.example import (
     make_images,
 )
 from robo_manip_baselines.data.images import image_checksum
-from robo_manip_baselines.data.schema import ATTRIBUTES, FIELDS
+from robo_manip_baselines.data.schema import ATTRIBUTES, fields_of
 from robo_manip_baselines.data.verify import damage_summary, verify_dataset, verify_file
 from robo_manip_baselines.errors import RequestError
 
@@ -38,7 +38,7 @@ def write(
 
 def seal(file: h5py.File) -> None:
     """Make the digest right again, so that only the damage itself can be found."""
-    arrays = {field.name: file[field.name][()] for field in FIELDS}
+    arrays = {name: file[name][()] for name in fields_of(int(file.attrs["schema_version"]))}
     checksums = {name: group["checksum"][()] for name, group in file["images"].items()}
     attributes = {item.name: loaded_attribute(item, file.attrs[item.name]) for item in ATTRIBUTES}
     file.attrs["content_sha256"] = content_digest(arrays, checksums, attributes)
@@ -121,7 +121,7 @@ DAMAGE: list[tuple[Callable[[h5py.File], Any], str]] = [
     (_assign("jaw_opening", 4, -0.01), "'jaw_opening' is negative at step 4"),
     (_assign("phase", 8, 3), "'phase' is 3 at step 8, of 3 phases"),
     (_attribute("schema", "lerobot"), "no episode: schema 'lerobot'"),
-    (_attribute("schema_version", np.int64(9)), "schema version 9; this release reads 1"),
+    (_attribute("schema_version", np.int64(9)), "schema version 9; this release reads 1, 2"),
     (_attribute("seed", "x"), "attribute 'seed' is no int"),
     (_attribute("versions", "{"), "attribute 'versions' cannot be read"),
     (_attribute("num_steps", np.int64(13)), "attribute 'num_steps' says 13, but 'time' has 12"),

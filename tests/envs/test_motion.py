@@ -70,6 +70,50 @@ def test_segment_starts_without_displacement_and_follows_the_recording(
     np.testing.assert_allclose(alike, 1.0, atol=1e-6)
 
 
+def foretold(**changes: Any) -> dict[str, Any]:
+    """Predictions that say in every frame: the mouth goes on as I say, not as it will."""
+    mouth = content()["mouth"]
+    ahead = np.arange(1, 6)[:, None] * [0.0, 0.01, 0.0]  # camera y, world z
+    return {"predicted_mouth": (mouth[:, None] + ahead).astype(np.float32), **changes}
+
+
+def test_predictions_are_read_and_relative_to_the_start(tmp_path: Path) -> None:
+    assert MotionLibrary.load(save(tmp_path)).segment(0, 0).prediction_error(0.0) is None
+    library = MotionLibrary.load(save(tmp_path, **foretold()))
+    segment = library.segment(0, 100)
+    assert segment.predicted is not None
+    # Frame 30: the mouth has moved by camera (3, 6, 9) mm, and is foretold to rise by 10 mm each.
+    wanted = [[9e-3, 3e-3, 6e-3 + 0.01 * k] for k in range(1, 6)]
+    np.testing.assert_allclose(segment.predicted[30], wanted, atol=1e-6)
+    error = segment.prediction_error(1.0)
+    assert error is not None
+    wanted = [[-3e-4 * k, -1e-4 * k, 0.01 * k - 2e-4 * k] for k in range(1, 6)]
+    np.testing.assert_allclose(error, wanted, atol=1e-6)
+    # The error of the last frame is held, and is known at the ends.
+    late = segment.prediction_error([1.0 - 1e-4, 1.0 + 0.02, -1.0, 100.0])
+    assert late is not None
+    assert late.shape == (4, 5, 3)
+    np.testing.assert_array_equal(late[1], error)
+    assert not np.array_equal(late[0], error)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (foretold(predicted_mouth=np.zeros((3, 5, 3))), "'predicted_mouth' has shape"),
+        (foretold(predicted_mouth=np.zeros((1280, 4, 3))), "'predicted_mouth' has shape"),
+        (foretold(predicted_mouth=np.full((1280, 5, 3), np.nan)), "not finite"),
+        (foretold(predicted_mouth=np.zeros((1280, 5, 3), int)), "type int64"),
+        (foretold(fps=np.array(25.0)), "of frames at 30 a second, 'fps' is 25.0"),
+    ],
+)
+def test_wrong_predictions_are_refused(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(RequestError, match=message):
+        MotionLibrary.load(save(tmp_path, **changes))
+
+
 @given(st.floats(min_value=-1.0, max_value=20.0))
 def test_interpolation_is_the_obvious_one(time: float) -> None:
     rng = np.random.default_rng(0)

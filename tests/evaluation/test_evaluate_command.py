@@ -16,11 +16,13 @@ import pytest
 
 from robo_manip_baselines.command import parse
 from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.evaluation.arm import arm_name
 from robo_manip_baselines.evaluation.evaluate_command import evaluate
-from robo_manip_baselines.evaluation.evaluation import arm_name, choose_acting, plan, run_name
+from robo_manip_baselines.evaluation.evaluation import choose_acting, plan, run_name
 from robo_manip_baselines.evaluation.results_file import read_results
 from robo_manip_baselines.expert.rollout_options import EXAMPLE, PolicyOptions, RolloutOptions
-from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.observation import Corruption, ObservationSpec
+from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import Checkpoint
 from robo_manip_baselines.policy.presets import Acting
 
@@ -157,6 +159,10 @@ def children_of_group(group: int) -> list[int]:
         ("--device abacus", "device 'abacus'"),
         ("--precision fp8", "unknown precision 'fp8'"),
         ("--clips me", "unknown clip 'me'"),
+        ("--error uniform", "trained with no corruption, not with error uniform, stats_sha256"),
+        ("--delay 3", "not with delay 3; leave the options as trained, or say --change_corruption"),
+        ("--change_corruption --error some", "unknown error model 'some'"),
+        ("--change_corruption --error uniform --error_stats no.json", "'no.json' cannot be read"),
         ("--face_motion no", "unknown face motion 'no'"),
     ],
 )
@@ -176,6 +182,8 @@ def test_wrong_requests(run_folder: Path, tmp_path: Path, text: str, message: st
         ("FeedinEnv --policy Act", "unknown environment 'FeedinEnv'"),
         ("FeedingEnv --scripted --checkpoint runs/x", "--checkpoint goes with --policy"),
         ("FeedingEnv --scripted --execute 3", "--execute goes with --policy"),
+        ("FeedingEnv --scripted --delay 3", "--delay goes with --policy"),
+        ("FeedingEnv --scripted --no_corruption", "--no_corruption goes with --policy"),
     ],
 )
 def test_wrong_requests_get_one_line_and_exit_code_2(
@@ -235,8 +243,64 @@ def test_options_of_the_environment_come_from_the_demonstrations(
     assert plan(options(run_folder)).seeds == range(1000, 1003)
 
 
+def test_the_corruption_is_the_trained_one_unless_changed(
+    run_folder: Path, make_checkpoint: MakeCheckpoint, tmp_path: Path
+) -> None:
+    trained = Corruption("uniform", delay=2).pinned()
+    spec = ObservationSpec(obs="current_pred", cameras=(), object_pose=True, corruption=trained)
+    run = tmp_path / "mlp_run"
+    make_checkpoint(run, spec=spec)
+
+    def planned(text: str = "", folder: Path = run) -> tuple[Corruption | None, str, str]:
+        evaluation = plan(options(folder, text))
+        return evaluation.task.spec.corruption, evaluation.arm, evaluation.out.name
+
+    arm, out = "current_pred_h2_uniform_delay2", "FeedingEnv_mlp_run"
+    assert planned() == (trained, arm, out)
+    assert planned("--error uniform --delay 2") == (trained, arm, out)
+    copy = tmp_path / "copy.json"
+    copy.write_bytes(DEFAULT_STATS.read_bytes())
+    same = replace(trained, error_stats=str(copy))
+    assert planned(f"--error_stats {copy}") == (same, arm, out)
+    with pytest.raises(RequestError, match=r"trained with error uniform, stats_sha256 .*, delay 2"):
+        planned("--delay 3")
+    assert planned("--change_corruption --delay 3") == (
+        replace(trained, delay=3),
+        f"{arm}_under_uniform_delay3",
+        f"{out}_under_uniform_delay3",
+    )
+    truth = (None, f"{arm}_under_truth", f"{out}_under_truth")
+    assert planned("--no_corruption") == truth
+    assert planned("--change_corruption --error none --delay 0") == truth
+    assert planned("--no_corruption", run_folder) == (None, "current_pred_h2", out)
+    late = planned("--change_corruption --delay 1", run_folder)
+    assert late == (Corruption(delay=1), "current_pred_h2_under_delay1", f"{out}_under_delay1")
+
+
+def test_another_corruption_gives_other_episodes_in_another_folder(
+    run_folder: Path, tmp_path: Path
+) -> None:
+    plain, noisy = tmp_path / "plain", tmp_path / "noisy"
+    evaluate(options(run_folder, "--num_episodes 2", out=plain))
+    changed = "--num_episodes 2 --change_corruption --error uniform --face_dropout 0.3"
+    evaluate(options(run_folder, changed, out=noisy))
+    results = read_results(noisy)
+    assert {result.arm for result in results} == {"current_pred_h2_under_uniform_dropout0.3"}
+    settings = json.loads((noisy / "evaluation.json").read_text())["settings"]
+    assert settings["observation"]["corruption"]["face_dropout"] == 0.3
+    assert settings["observation"]["corruption"]["stats_sha256"] == load_error_stats().sha256
+    before = (noisy / "results.jsonl").read_bytes()
+    evaluate(options(run_folder, f"{changed} --num_envs 1 --workers 1", out=noisy))
+    assert (noisy / "results.jsonl").read_bytes() == before
+    with pytest.raises(RequestError, match="holds results with observation"):
+        evaluate(options(run_folder, "--num_episodes 2", out=noisy))
+    assert {result.arm for result in read_results(plain)} == {"current_pred_h2"}
+
+
 def test_names() -> None:
     assert arm_name(ObservationSpec()) == "baseline"
     assert arm_name(ObservationSpec(obs="current_pred", horizon=5)) == "current_pred_h5"
+    noisy = ObservationSpec(obs="current_pred", horizon=3, corruption=Corruption("uniform"))
+    assert arm_name(noisy) == "current_pred_h3_uniform"
     assert run_name(Path("runs/act_current")) == "act_current"
     assert run_name(Path("runs/x/checkpoints/step_00000005")) == "x_step_00000005"

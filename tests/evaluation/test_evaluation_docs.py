@@ -14,6 +14,7 @@ from robo_manip_baselines.evaluation.failure import FAILURES
 from robo_manip_baselines.evaluation.result import EpisodeResult, Offset
 from robo_manip_baselines.evaluation.results_file import ResultsFile
 from robo_manip_baselines.expert.rollout_options import PolicyOptions
+from robo_manip_baselines.observation.options import CorruptionOptions
 from robo_manip_baselines.policy.checkpoint import Checkpoint
 
 PAGE = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
@@ -50,7 +51,8 @@ def test_every_kind_of_failure_is_there() -> None:
 
 def test_every_option_is_there() -> None:
     named = set(re.findall(r"`--(\w+)`", " ".join(row[0] for row in rows("Options"))))
-    assert {item.name for item in fields(PolicyOptions)} <= named
+    options = {item.name for kind in (PolicyOptions, CorruptionOptions) for item in fields(kind)}
+    assert options - {"corruption"} | {"no_corruption"} <= named
 
 
 @pytest.mark.long

@@ -10,7 +10,8 @@ import yaml
 from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.presets import PRESETS
-from robo_manip_baselines.training.options import TrainOptions, parse_options
+from robo_manip_baselines.training.options import FREE, TrainOptions, parse_options
+from robo_manip_baselines.training.run_folder import require_same_config
 
 
 def parse(line: str, *, has_gpu: bool = False) -> TrainOptions[ActConfig]:
@@ -108,6 +109,9 @@ def test_one_budget_replaces_the_other(
         "Act --preset paper --paper_compat --cameras top --image_size 30x40 --object_pose",
         "Act --preset cpu --epochs 7 --obs baseline --no_object_pose --dataset a/b --compile",
         "Mlp --obs current --num_episodes 3 --arms both",
+        "Act --preset cpu --error uniform --delay 3 --face_dropout 0.1 --dropout 0.2",
+        "Mlp --obs current --detector_rate 10 --face_dropout_length 4 --corruption_seed 2",
+        "Mlp --error gaussian --error_stats a/b.json --no_corruption",
     ],
 )
 def test_saved_options_read_back_as_they_were(tmp_path: Path, line: str) -> None:
@@ -120,6 +124,26 @@ def test_saved_options_read_back_as_they_were(tmp_path: Path, line: str) -> None
         options.training,
         options.spec,
     )
+
+
+def test_runs_of_older_releases_are_the_same_runs(tmp_path: Path) -> None:
+    """Their config.yaml knows of no corruption but ``error: none``."""
+    config = parse("Mlp").to_config()
+    new = ("error_stats", "delay", "face_dropout", "face_dropout_length", "detector_rate")
+    old = {name: value for name, value in config.items() if name not in (*new, "corruption_seed")}
+    assert old["error"] == "none"
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(old))
+    require_same_config(tmp_path, config, FREE)
+    for changed in ("--delay 2", "--no_corruption --delay 2", "--error uniform"):
+        with pytest.raises(RequestError, match="holds a run with"):
+            require_same_config(tmp_path, parse(f"Mlp {changed}").to_config(), FREE)
+
+
+def test_dropout_of_the_network_is_not_that_of_the_face() -> None:
+    options = parse("Act --preset cpu --dropout 0.3 --face_dropout 0.1")
+    assert options.network.dropout == 0.3
+    assert options.spec.corruption is not None
+    assert options.spec.corruption.face_dropout == 0.1
 
 
 def test_resuming_reads_the_options_of_the_run(tmp_path: Path) -> None:
@@ -136,6 +160,13 @@ def test_resuming_reads_the_options_of_the_run(tmp_path: Path) -> None:
         ("Act --preset cpu --horizon 4 --seed 3", "runs/act_current_pred_h4_cpu_seed3"),
         ("Mlp --obs current", "runs/mlp_current_cpu_seed0"),
         ("Act --preset paper --obs baseline --out x/y", "x/y"),
+        ("Act --preset cpu --error uniform", "runs/act_current_pred_h2_uniform_cpu_seed0"),
+        ("Act --preset cpu --error none --delay 0", "runs/act_current_pred_h2_cpu_seed0"),
+        ("Mlp --error uniform --no_corruption", "runs/mlp_current_pred_h2_cpu_seed0"),
+        (
+            "Mlp --error model --delay 3 --face_dropout 0.1 --detector_rate 10",
+            "runs/mlp_current_pred_h2_model_delay3_dropout0.1_rate10_cpu_seed0",
+        ),
     ],
 )
 def test_run_folders(line: str, folder: str) -> None:
@@ -158,6 +189,11 @@ def test_run_folders(line: str, folder: str) -> None:
         ("Act --chunk_size 0", ["chunk_size 0: must be 1 or more"]),
         ("Act --obs all", ["unknown observation preset 'all'", "valid: baseline"]),
         ("Act --horizon 6", ["horizon 6: must be 1 to 5"]),
+        ("Act --error some", ["unknown error model 'some'", "valid: empirical, gaussian"]),
+        ("Act --obs current --error uniform", ["'uniform' is one of forecasts", "current_pred"]),
+        ("Act --obs baseline --delay 2", ["'delay2' corrupts the mouth"]),
+        ("Act --face_dropout 1", ["face_dropout 1: must be 0 to"]),
+        ("Act --delay x", ["--delay", "'x'"]),
         ("Act --cameras left", ["unknown camera 'left'", "top"]),
         ("Act --image_size big", ["image size 'big'", "480x640"]),
         ("Act --log_every 0", ["log_every 0: must be 1 or more"]),

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
 from robo_manip_baselines.policy.checkpoint_files import list_checkpoints
 from robo_manip_baselines.training.metrics import read_metrics
@@ -186,6 +187,21 @@ def test_other_demonstrations_are_not_resumed(line: str, episodes: Path, tmp_pat
     train(f"Mlp {TINY} --dataset {episodes} --out {tmp_path / 'all'} --steps 2".split())
     with pytest.raises(RequestError, match=r"are not the ones that .* was trained on"):
         train(f"Mlp --out {tmp_path / 'all'} --resume --dataset {fewer}".split())
+
+
+def test_other_error_statistics_are_not_resumed(line: str, tmp_path: Path) -> None:
+    stats = tmp_path / "stats.json"
+    stats.write_bytes(DEFAULT_STATS.read_bytes())
+    more = f"--error uniform --error_stats {stats} --steps 2"
+    train(f"Mlp {line} {more}".split())
+    run = tmp_path / "run"
+    corruption = read_checkpoint(run).spec.corruption
+    assert corruption is not None
+    assert corruption.stats_sha256 == load_error_stats().sha256
+    assert train(f"Mlp --out {run} --resume".split()) == 0
+    stats.write_bytes(DEFAULT_STATS.read_bytes() + b"\n")
+    with pytest.raises(RequestError, match=r"error statistics are not the ones that .*/run'"):
+        train(f"Mlp --out {run} --resume".split())
 
 
 def test_missing_demonstrations_name_the_command(tmp_path: Path) -> None:

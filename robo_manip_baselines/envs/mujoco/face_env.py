@@ -27,8 +27,9 @@ from robo_manip_baselines.envs.mujoco.vx300s import (
     FINGER_OPEN,
     HOME_QPOS,
 )
-from robo_manip_baselines.errors import require_choice
+from robo_manip_baselines.errors import RequestError, require_choice
 from robo_manip_baselines.observation import ObservationSpec, Truth, observe
+from robo_manip_baselines.observation.detector import NO_PREDICTION, Detector
 
 CONTROL_PERIOD = 0.02
 """s between two actions (paper, Algorithm 1, line 2)."""
@@ -71,7 +72,10 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self.observation_spec = spec
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
+        self._detector = Detector.of(spec)
         self.library = MotionLibrary.load(motion_library)
+        if spec.corruption and spec.corruption.error == "model" and self.library.predicted is None:
+            raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
         self.clips = (
             None
             if clips is None
@@ -158,6 +162,10 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         position, orientation = self.replay.bodies["face/mouth"]
         self.data.joint("face/cavity").qpos = (*position[0], *orientation[0])
         mujoco.mj_forward(self.model, self.data)
+        if self._detector:
+            # Last, so that the world is the one that it would be without corruption.
+            drawn = int(self.np_random.integers(2**32)) if seed is None else seed
+            self._detector.reset(drawn)
         return self.observe(), {}
 
     def simulate(self, action: NDArray[Any]) -> None:
@@ -238,6 +246,16 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return self.replay.mouth[self.replay.control_index(self._motion_step())].copy()
 
     @property
+    def predicted_mouth(self) -> NDArray[np.float64] | None:
+        """(K - 1, 3) m, world: the mouth 1 ... 5 frames ahead as a trained predictor foretold it.
+
+        None if the motion library holds no predictions.
+        """
+        predicted = self.replay.predicted
+        index = self.replay.control_index(self._motion_step())
+        return None if predicted is None else predicted[index].copy()
+
+    @property
     def jaw_opening(self) -> float:
         """m between the inner lips."""
         return float(self.replay.jaw[self.replay.control_index(self._motion_step())])
@@ -259,11 +277,14 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             end_effector_position=self.gripper_position,
             mouth_position=self.mouth_track,
             object_position=self.object_position(),
+            predicted_mouth=self.predicted_mouth,
         )
 
     def observe(self) -> dict[str, NDArray[Any]]:
         """Build the observation that the spec asks for, rendering only its cameras."""
-        observation: dict[str, NDArray[Any]] = {**observe(self.observation_spec, self.truth())}
+        truth = self.truth()
+        report = self._detector.report(truth) if self._detector else None
+        observation: dict[str, NDArray[Any]] = {**observe(self.observation_spec, truth, report)}
         if self.observation_spec.cameras:
             views = self.renderer.render(self.data, self.observation_spec.cameras)
             for key, camera in self.observation_spec.image_keys().items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -17,7 +17,7 @@ from robo_manip_baselines.envs.mujoco.feeding_success import (
     is_inside_mouth,
 )
 from robo_manip_baselines.envs.mujoco.scene import CUBE_SIZE, FACE, add_cube
-from robo_manip_baselines.observation import CAMERAS, ObservationSpec
+from robo_manip_baselines.observation import CAMERAS, Corruption, ObservationSpec
 
 CUBE_LOW = np.array([0.12, 0.42])
 CUBE_HIGH = np.array([0.22, 0.58])
@@ -65,6 +65,8 @@ class FeedingEnv(FaceEnv):
     | ``images/<camera>`` | (height, width, 3) | per camera | RGB |
 
     The time is that of the episode, so that it tells a policy how long the mouth has been moving.
+    With a ``corruption`` it is the time at which the mouth was seen, and the mouth is as it was
+    reported; the distances are those from the gripper as it is now.
 
     ## Reward
 
@@ -114,7 +116,9 @@ class FeedingEnv(FaceEnv):
     | ``cameras`` | all three | any of top, angle, front_close; ``()`` for none |
     | ``image_size`` | (480, 640) | height and width |
     | ``object_pose`` | False | show the cube's position |
-    | ``error`` | ``"none"`` | what stands between true and observed mouth |
+    | ``corruption`` | None | what stands between true and shown mouth: an
+    ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
+    3}``; None shows the truth |
     | ``arms`` | ``"right"`` | right or both |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
@@ -138,8 +142,8 @@ class FeedingEnv(FaceEnv):
         cameras: Sequence[str] = CAMERAS,
         image_size: tuple[int, int] = (480, 640),
         object_pose: bool = False,
-        error: str = "none",
         arms: str = "right",
+        corruption: Corruption | Mapping[str, Any] | None = None,
         face_motion: str = "episode",
         clips: Sequence[str] | None = None,
         motion_library: str | None = None,
@@ -154,8 +158,10 @@ class FeedingEnv(FaceEnv):
                 cameras=tuple(cameras),
                 image_size=(image_size[0], image_size[1]),
                 object_pose=object_pose,
-                error=error,
                 arms=arms,
+                corruption=(
+                    Corruption.of(corruption) if isinstance(corruption, Mapping) else corruption
+                ),
             ),
             face_motion=face_motion,
             clips=clips,

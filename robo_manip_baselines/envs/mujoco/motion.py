@@ -1,6 +1,7 @@
 """Recorded face motion: the library that ships with the package, and segments drawn from it.
 
-Shapes: N frames of the whole library, R runs, M frames of a segment, ``...`` any shape of times.
+Shapes: N frames of the whole library, R runs, M frames of a segment, H = 5 frames of a prediction,
+``...`` any shape of times.
 """
 
 from __future__ import annotations
@@ -18,11 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from robo_manip_baselines.envs.mujoco.motion_check import PREDICTION, find_problem
 from robo_manip_baselines.errors import RequestError, require_choice
 from robo_manip_baselines.observation import MAX_HORIZON
 
-SCHEMA = "recorded_face_motion"
-VERSION = 1
 DEFAULT_LIBRARY = Path(str(files("robo_manip_baselines.envs.mujoco") / "assets/face_motion.npz"))
 
 SEGMENT_DURATION = 12.0
@@ -31,17 +31,6 @@ SEGMENT_DURATION = 12.0
 WORLD_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """World axes (x right, y forward, z up) from the recording camera's (x right, y up, z towards
 it), for a face that looks along world +x."""
-
-_ARRAYS = {
-    "time": (1, "f"),
-    "mouth": (2, "f"),
-    "orientation": (2, "f"),
-    "jaw": (1, "f"),
-    "run_start": (1, "i"),
-    "run_length": (1, "i"),
-    "run_clip": (1, "U"),
-    "run_subject": (1, "U"),
-}
 
 
 @dataclass(frozen=True)
@@ -57,6 +46,8 @@ class MotionSegment:
         subject: id of the person.
         start: first frame, counted from the start of the run.
         index: the same frame, counted from the start of the library.
+        predicted: (M, H, 3) m, world axes, where a trained predictor said in each frame that the
+            mouth would be 1 ... H frames later, as a displacement; None in a library without.
     """
 
     fps: float
@@ -67,6 +58,25 @@ class MotionSegment:
     subject: str
     start: int
     index: int
+    predicted: NDArray[np.float64] | None = None
+
+    def prediction_error(self, time: ArrayLike) -> NDArray[np.float64] | None:
+        """Return prediction minus truth, (..., H, 3) m, of the last frame up to ``time``.
+
+        Args:
+            time: (...) s since the start of the segment; held at both ends outside it.
+
+        Returns:
+            None in a library without predictions.
+        """
+        if self.predicted is None:
+            return None
+        last = len(self.jaw) - 1
+        # A millionth of a frame for times that are meant to be those of frames.
+        frame = np.floor(np.asarray(time, dtype=np.float64) * self.fps + 1e-6).astype(np.int64)
+        frame = np.clip(frame, 0, last)
+        ahead = np.arange(1, self.predicted.shape[1] + 1)
+        return self.predicted[frame] - self.displacement[np.minimum(frame[..., None] + ahead, last)]
 
     def at(
         self, time: ArrayLike
@@ -107,6 +117,8 @@ class MotionLibrary:
         run_clip, run_subject: (R,) ids.
         metadata: attribution, camera model, and what was left out.
         source: the file it came from.
+        predicted: (N, H, 3) m, where a trained predictor said in each frame that the mouth would
+            be 1 ... H frames later; None if the library has no predictions.
     """
 
     fps: float
@@ -119,6 +131,7 @@ class MotionLibrary:
     run_subject: tuple[str, ...]
     metadata: dict[str, Any]
     source: Path
+    predicted: NDArray[np.float64] | None = None
 
     @classmethod
     def load(cls, path: Path | str | None = None) -> MotionLibrary:
@@ -142,7 +155,7 @@ class MotionLibrary:
             raise RequestError(
                 f"motion library '{source}' cannot be read ({reason}); {remedy}"
             ) from error
-        problem = _find_problem(content)
+        problem = find_problem(content)
         if problem:
             raise RequestError(f"motion library '{source}' is damaged: {problem}; {remedy}")
         return cls(
@@ -156,6 +169,7 @@ class MotionLibrary:
             run_subject=tuple(str(subject) for subject in content["run_subject"]),
             metadata=json.loads(str(content["metadata"])),
             source=source,
+            predicted=content[PREDICTION].astype(np.float64) if PREDICTION in content else None,
         )
 
     def starts(self, duration: float = SEGMENT_DURATION) -> NDArray[np.int64]:
@@ -203,6 +217,9 @@ class MotionLibrary:
         run_end = int(self.run_start[run] + self.run_length[run])
         end = min(begin + math.ceil(duration * self.fps) + 1 + MAX_HORIZON, run_end)
         moved = self.mouth[begin:end] - self.mouth[begin]
+        predicted = None
+        if self.predicted is not None:
+            predicted = (self.predicted[begin:end] - self.mouth[begin]) @ WORLD_FROM_CAMERA.T
         return MotionSegment(
             fps=self.fps,
             displacement=moved @ WORLD_FROM_CAMERA.T,
@@ -212,40 +229,5 @@ class MotionLibrary:
             subject=self.run_subject[run],
             start=start,
             index=begin,
+            predicted=predicted,
         )
-
-
-def _find_problem(content: dict[str, NDArray[Any]]) -> str | None:
-    """Return what is wrong with the arrays of a library file, or None."""
-    if str(content.get("schema")) != SCHEMA:
-        return f"schema is '{content.get('schema')}', not '{SCHEMA}'"
-    if str(content.get("version")) != str(VERSION):
-        return f"version is {content.get('version')}, this release reads {VERSION}"
-    fps = content.get("fps", np.array(0.0))
-    if fps.shape or fps.dtype.kind not in "fi" or not 0.0 < float(fps) < np.inf:
-        return "'fps' must be one positive number"
-    try:
-        json.loads(str(content["metadata"]))
-    except (KeyError, ValueError):
-        return "'metadata' is missing or not JSON"
-    for name, (ndim, kind) in _ARRAYS.items():
-        if name not in content:
-            return f"'{name}' is missing"
-        if content[name].ndim != ndim or content[name].dtype.kind != kind:
-            return f"'{name}' has shape {content[name].shape} and type {content[name].dtype}"
-        if kind == "f" and not np.isfinite(content[name]).all():
-            return f"'{name}' holds values that are not finite"
-    frames = len(content["time"])
-    if content["mouth"].shape != (frames, 3) or content["orientation"].shape != (frames, 4):
-        return "'mouth' and 'orientation' must have a row per frame, of 3 and 4 numbers"
-    if len(content["jaw"]) != frames:
-        return "'jaw' must have a number per frame"
-    if not np.allclose(np.linalg.norm(content["orientation"], axis=1), 1.0, atol=1e-3):
-        return "'orientation' holds quaternions that are not of unit length"
-    start, length = content["run_start"], content["run_length"]
-    counts = {len(content[name]) for name in ("run_start", "run_length", "run_clip", "run_subject")}
-    if len(counts) != 1:
-        return "the run_* arrays differ in length"
-    if (start < 0).any() or (length < 1).any() or (start + length > frames).any():
-        return "a run lies outside the frames"
-    return None

@@ -29,6 +29,9 @@ class FaceReplay:
     Attributes:
         bodies: for each mocap body, positions (P, 3) m and orientations (P, 4) wxyz, world.
         mouth: (T, K, 3) m, world: the mouth now and at ``FRAMES_AHEAD``.
+        predicted: (T, K - 1, 3) m, world: the mouth at ``FRAMES_AHEAD`` but for now, as a trained
+            predictor foretold it; None if the recorded motion came without. Exact at video frames;
+            between them the predictor's last error is held.
         jaw: (T,) m between the inner lips.
         opening: (T, 2) m, half width and half height of the mouth's opening.
         substeps: physics steps in a control step.
@@ -39,6 +42,7 @@ class FaceReplay:
     jaw: NDArray[np.float64]
     opening: NDArray[np.float64]
     substeps: int
+    predicted: NDArray[np.float64] | None = None
 
     @classmethod
     def lay_out(
@@ -64,6 +68,7 @@ class FaceReplay:
         physics = np.arange(round(duration / timestep) + 1) * timestep
         displacement, orientation, recorded_jaw = segment.at(physics)
         ahead, _, _ = segment.at(physics[::substeps, None] + FRAMES_AHEAD)
+        error = segment.prediction_error(physics[::substeps])
         jaw = recorded_jaw + REST_OPENING
         return cls(
             bodies=face.body_poses(start_position + displacement, orientation, jaw),
@@ -71,6 +76,7 @@ class FaceReplay:
             jaw=jaw[::substeps],
             opening=np.stack(face.opening(jaw[::substeps]), axis=-1),
             substeps=substeps,
+            predicted=None if error is None else start_position + ahead[:, 1:] + error,
         )
 
     def physics_index(self, step: int) -> int:
