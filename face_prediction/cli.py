@@ -15,21 +15,29 @@ import tyro
 
 from face_prediction.dataset.build_command import BuildDatasetOptions, run_build_dataset
 from face_prediction.errors import RequestError
+from face_prediction.evaluate_command import EvaluateOptions, run_evaluate
+from face_prediction.export_stats_command import ExportStatsOptions, run_export_stats
 from face_prediction.extract_command import ExtractOptions, run_extract
+from face_prediction.live_command import LiveOptions, run_live
 from face_prediction.motion_command import ExportMotionOptions, run_export_motion
+from face_prediction.predict_command import PredictOptions, run_predict
 from face_prediction.surface import ExportSurfaceOptions, export_surface
+from face_prediction.train_command import run_train
+from face_prediction.training.options import TrainOptions
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _FRAME = re.compile(r"^[\s│|╭╰─+-]+|[\s│|╮╯─+-]+$")
 
 logger = logging.getLogger(__name__)
 
-DESCRIPTION = """Faces in video: tracks; motion and surface lifted from them; training sequences.
+DESCRIPTION = """Faces in video: tracks, recorded motion, forecasts and how good they are.
 
 Example:
   face-prediction extract clips/*.mp4 --out face_tracks
   face-prediction export-motion face_tracks --attribution clips.csv --out face_motion.npz
   face-prediction build-dataset face_tracks --videos clips --attribution clips.csv
+  face-prediction train residual --dataset face_dataset --test_fold 0
+  face-prediction evaluate --dataset face_dataset --checkpoints checkpoints/residual_cpu_fold0_seed0
 """
 
 #: (name, options, function) of every subcommand
@@ -38,6 +46,11 @@ COMMANDS: tuple[tuple[str, type, Callable[[Any], int | None]], ...] = (
     ("export-motion", ExportMotionOptions, run_export_motion),
     ("export-surface", ExportSurfaceOptions, export_surface),
     ("build-dataset", BuildDatasetOptions, run_build_dataset),
+    ("train", TrainOptions, run_train),
+    ("evaluate", EvaluateOptions, run_evaluate),
+    ("export-stats", ExportStatsOptions, run_export_stats),
+    ("predict", PredictOptions, run_predict),
+    ("live", LiveOptions, run_live),
 )
 
 

@@ -1,6 +1,6 @@
 """The recorded-motion library: runs of face motion in one file, and its promises.
 
-Legend: N frames of all runs one after another, R runs.
+Legend: N frames of all runs one after another, R runs, H horizon.
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ class MotionLibrary:
     run_clip: np.ndarray  # (R,) names
     run_subject: np.ndarray  # (R,) names
     metadata: dict[str, Any]
+    #: (N, H, 3) float32 m: where the mouth was forecast to be 1 ... H frames after each frame, in
+    #: the frame of ``mouth``; None: nothing was forecast
+    predicted_mouth: np.ndarray | None = None
 
     @property
     def seconds(self) -> float:
@@ -88,23 +91,23 @@ def build_library(
 
 def save_library(path: Path, library: MotionLibrary) -> None:
     """Write ``library`` to ``path``, whole or not at all."""
-    write_npz(
-        path,
-        {
-            "schema": np.array(SCHEMA),
-            "version": np.array(VERSION),
-            "fps": np.array(library.fps, dtype=np.float64),
-            "time": library.time,
-            "mouth": library.mouth,
-            "orientation": library.orientation,
-            "jaw": library.jaw,
-            "run_start": library.run_start,
-            "run_length": library.run_length,
-            "run_clip": library.run_clip,
-            "run_subject": library.run_subject,
-            "metadata": np.array(json.dumps(library.metadata, sort_keys=True)),
-        },
-    )
+    arrays = {
+        "schema": np.array(SCHEMA),
+        "version": np.array(VERSION),
+        "fps": np.array(library.fps, dtype=np.float64),
+        "time": library.time,
+        "mouth": library.mouth,
+        "orientation": library.orientation,
+        "jaw": library.jaw,
+        "run_start": library.run_start,
+        "run_length": library.run_length,
+        "run_clip": library.run_clip,
+        "run_subject": library.run_subject,
+        "metadata": np.array(json.dumps(library.metadata, sort_keys=True)),
+    }
+    if library.predicted_mouth is not None:
+        arrays["predicted_mouth"] = library.predicted_mouth
+    write_npz(path, arrays)
 
 
 def load_library(path: Path) -> MotionLibrary:
@@ -133,14 +136,19 @@ def load_library(path: Path) -> MotionLibrary:
         run_clip=require_array(path, arrays, "run_clip", (runs,), "U"),
         run_subject=require_array(path, arrays, "run_subject", (runs,), "U"),
         metadata=metadata,
+        predicted_mouth=(
+            require_array(path, arrays, "predicted_mouth", (frames, None, 3), "f")
+            if "predicted_mouth" in arrays
+            else None
+        ),
     )
     _check(path, arrays, library)
     return library
 
 
 def _check(path: Path, arrays: Arrays, library: MotionLibrary) -> None:
-    for key in ("fps", "time", "mouth", "orientation", "jaw"):
-        if not np.all(np.isfinite(arrays[key])):
+    for key in ("fps", "time", "mouth", "orientation", "jaw", "predicted_mouth"):
+        if key in arrays and not np.all(np.isfinite(arrays[key])):
             raise RequestError(f"{path}: '{key}' holds NaN or infinity")
     ends = library.run_start + library.run_length
     joined = np.concatenate([[0], ends])

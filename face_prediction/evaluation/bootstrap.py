@@ -8,7 +8,7 @@ as many of the person's sequences as there are, with replacement (Davison and Hi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,20 +55,59 @@ def cluster_bootstrap(
         raise RequestError(f"{len(subjects)} subjects for {len(values)} sequences; one for each")
     if not 0 < level < 1:
         raise RequestError(f"level {level}; must be between 0 and 1")
-    if resamples < 1 or seed < 0:
-        raise RequestError(f"{resamples} resamples with seed {seed}; 1 or more, and 0 or more")
     of_rows = _mean if statistic is None else statistic
-    names, number = np.unique(np.asarray(subjects), return_inverse=True)
-    order, sizes = np.argsort(number, kind="stable"), np.bincount(number)
-    rng = np.random.default_rng(seed)
     drawn = np.array(
-        [of_rows(values[order[_resample(sizes, rng)]]) for _ in range(resamples)], dtype=np.float64
+        [of_rows(values[rows]) for rows in _draws(subjects, resamples, seed)], dtype=np.float64
     )
+    low, high = percentile_bounds(drawn, level)
+    estimate = np.asarray(of_rows(values), dtype=np.float64)
+    return Interval(estimate, low, high, len(set(subjects)))
+
+
+def resample_counts(
+    subjects: Sequence[str], *, resamples: int = 2000, seed: int = 0
+) -> NDArray[np.int64]:
+    """How often (resamples, N) each sequence is in the resamples of `cluster_bootstrap`.
+
+    For statistics that weights are enough for, all resamples at once.
+
+    Args:
+        subjects: N names.
+        resamples: how many.
+        seed: of the resampling.
+
+    Raises:
+        RequestError: no rows, or a number out of range.
+    """
+    if not subjects:
+        raise RequestError("no sequences to resample")
+    draws = _draws(subjects, resamples, seed)
+    return np.stack([np.bincount(rows, minlength=len(subjects)) for rows in draws])
+
+
+def percentile_bounds(
+    drawn: NDArray[np.floating], level: float = 0.95
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper bounds (...) of the middle ``level`` of resampled statistics (W, ...).
+
+    NaN where no resample has a number.
+    """
     tail = (1 - level) / 2
-    nothing = np.isnan(drawn).all(axis=0)  # no forecast in any resample: no bounds either
+    nothing = np.isnan(drawn).all(axis=0)
     bounds = np.nanquantile(np.where(nothing, 0.0, drawn), [tail, 1 - tail], axis=0)
     low, high = np.where(nothing, np.nan, bounds)
-    return Interval(np.asarray(of_rows(values), dtype=np.float64), low, high, len(names))
+    return low, high
+
+
+def _draws(subjects: Sequence[str], resamples: int, seed: int) -> Iterator[NDArray[np.intp]]:
+    """Drawn rows, resample by resample."""
+    if resamples < 1 or seed < 0:
+        raise RequestError(f"{resamples} resamples with seed {seed}; 1 or more, and 0 or more")
+    number = np.unique(np.asarray(subjects), return_inverse=True)[1]
+    order, sizes = np.argsort(number, kind="stable"), np.bincount(number)
+    rng = np.random.default_rng(seed)
+    for _ in range(resamples):
+        yield order[_resample(sizes, rng)]
 
 
 def _resample(sizes: NDArray[np.intp], rng: np.random.Generator) -> NDArray[np.intp]:

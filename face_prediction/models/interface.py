@@ -98,13 +98,20 @@ class PredictorModel(nn.Module, ABC):
         """
 
     @abstractmethod
-    def decode(self, landmarks: Tensor, features: Tensor, last_picture: Tensor) -> Output:
+    def decode(
+        self,
+        landmarks: Tensor,
+        features: Tensor,
+        last_picture: Tensor,
+        make_pictures: bool = True,
+    ) -> Output:
         """Forecast H frames.
 
         Args:
             landmarks: (B, T, L, 2).
             features: (B, P - span + 1, ...) from `encode`.
             last_picture: (B, S, S, 3) uint8, of the last frame.
+            make_pictures: False: `Output.pictures` is not wanted, and need not be made.
         """
 
     @abstractmethod

@@ -19,6 +19,8 @@ print(*{{name.partition(".")[0] for name in sys.modules}})
 
 # Networks and their training are made of torch; everything else must do without it.
 OF_TORCH = (
+    "face_prediction.models",
+    "face_prediction.training",
     "robo_manip_baselines.policy.act",
     "robo_manip_baselines.policy.chunk_policy",
     "robo_manip_baselines.policy.interface",

@@ -53,13 +53,21 @@ class ResidualModel(PredictorModel):
         tokens: Tensor = self.regions(pictures, landmarks)
         return tokens
 
-    def decode(self, landmarks: Tensor, features: Tensor, last_picture: Tensor) -> Output:
+    def decode(
+        self,
+        landmarks: Tensor,
+        features: Tensor,
+        last_picture: Tensor,
+        make_pictures: bool = True,
+    ) -> Output:
         """Forecast after the last frame."""
         newest = torch.tensor([landmarks.shape[1] - 1], device=landmarks.device)
         forecast, scale = self._landmarks(landmarks, newest, features)
         return Output(
             landmarks=forecast[:, 0],
-            pictures=self._pictures(landmarks[:, -1], forecast[:, 0], last_picture),
+            pictures=self._pictures(landmarks[:, -1], forecast[:, 0], last_picture)
+            if make_pictures
+            else None,
             mouth_scale=scale[:, 0],
             degrees_of_freedom=self.correction.degrees_of_freedom,
         )

@@ -19,6 +19,7 @@ from face_prediction.models.residual.experts import (
     BLOCKS,
     EXPERTS,
     OTHER_PHASES,
+    Expert,
     adapted,
     features,
     fit_people,
@@ -61,14 +62,16 @@ class AdaptivePrior(nn.Module):
     Args:
         horizon: H.
         shapes: K.
+        experts: that are mixed, beside the one that expects no motion.
     """
 
     basis: Tensor
     step: Tensor
 
-    def __init__(self, horizon: int, shapes: int) -> None:
+    def __init__(self, horizon: int, shapes: int, experts: tuple[Expert, ...] = EXPERTS) -> None:
         super().__init__()
         self.horizon = horizon
+        self.experts = experts
         self.register_buffer("basis", torch.zeros(shapes, 2 * NUM_LANDMARKS))
         self.register_buffer("step", torch.ones(shapes))
         outputs = horizon * (2 + shapes)
@@ -126,7 +129,7 @@ class AdaptivePrior(nn.Module):
             x = features(block, mouth, shapes) / self.get_buffer(f"scale_{i}")
             people.append((x, x @ self.get_buffer(f"people_{i}")))
         result = [torch.zeros_like(people[0][1])]
-        for expert in EXPERTS:
+        for expert in self.experts:
             x, forecast = people[expert.block]
             if expert.shrink is not None and known is not None:
                 count = known.shape[1]

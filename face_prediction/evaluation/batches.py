@@ -1,0 +1,102 @@
+"""Landmarks and pictures of some sequences at once, each picture decoded once for all predictors.
+
+Legend: B sequences, T frames of history, H horizon, L = 468 landmarks, P pictures, S their side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from face_prediction.dataset.pictures import REDUCTIONS
+from face_prediction.dataset.reader import FaceDataset
+from face_prediction.errors import RequestError
+from face_prediction.predictor import PictureNeeds
+
+
+@dataclass(frozen=True)
+class PicturePlan:
+    """Which pictures are decoded: for each side S, the last so many frames of the history.
+
+    Those of the future are decoded too, at the sides in ``future``.
+    """
+
+    history: Mapping[int, int]
+    future: frozenset[int]
+
+    @classmethod
+    def of(cls, needs: Iterable[PictureNeeds], future: Iterable[int]) -> PicturePlan:
+        """What serves all ``needs``, with the future at the sides ``future``."""
+        history: dict[int, int] = {}
+        for need in needs:
+            if need.frames:
+                history[need.size] = max(need.frames, history.get(need.size, 0))
+        return cls(history, frozenset(future))
+
+
+class Batch:
+    """B sequences; pictures may be those of other sequences.
+
+    Args:
+        dataset: where they are.
+        indices: (B,) sequences whose landmarks these are.
+        plan: what to decode.
+        pictures_of: (B,) sequences whose pictures are shown; None: their own.
+    """
+
+    def __init__(
+        self,
+        dataset: FaceDataset,
+        indices: Sequence[int],
+        plan: PicturePlan,
+        pictures_of: Sequence[int] | None = None,
+    ) -> None:
+        settings = dataset.manifest.settings
+        frames = np.stack([dataset.landmarks(index)[..., :2] for index in indices])
+        #: (B, T, L, 2) and (B, H, L, 2) float32
+        self.history: NDArray[np.float32] = frames[:, : settings.history]
+        self.future: NDArray[np.float32] = frames[:, settings.history :]
+        self._past: dict[int, NDArray[np.uint8]] = {}
+        self._coming: dict[int, NDArray[np.uint8]] = {}
+        shown = indices if pictures_of is None else pictures_of
+        for size in sorted({*plan.history, *plan.future}):
+            past = plan.history.get(size, 0)
+            stop = settings.length if size in plan.future else settings.history
+            wanted = slice(settings.history - past, stop)
+            reduce = reduction(settings.crop_size, size)
+            pictures = np.stack([dataset.pictures(index, wanted, reduce) for index in shown])
+            self._past[size], self._coming[size] = pictures[:, :past], pictures[:, past:]
+
+    def shown(self, needs: PictureNeeds) -> NDArray[np.uint8] | None:
+        """Pictures (B, P, S, S, 3) of the last P frames of the history; None for P = 0."""
+        if not needs.frames:
+            return None
+        past = self._past[needs.size]
+        return past[:, past.shape[1] - needs.frames :]
+
+    def last(self, size: int) -> NDArray[np.uint8]:
+        """The last picture (B, 1, S, S, 3) of each history."""
+        return self._past[size][:, -1:]
+
+    def coming(self, size: int) -> NDArray[np.uint8]:
+        """Pictures (B, H, S, S, 3) of the frames to be forecast."""
+        return self._coming[size]
+
+
+def reduction(crop_size: int, size: int) -> int:
+    """What pictures of side ``crop_size`` are reduced by to be of side ``size``.
+
+    Raises:
+        RequestError: they cannot be.
+    """
+    for reduce in REDUCTIONS:
+        if size * reduce == crop_size:
+            return reduce
+    sizes = ", ".join(str(crop_size // reduce) for reduce in REDUCTIONS)
+    raise RequestError(
+        f"pictures of {size} pixels: this dataset can give {sizes}; "
+        "use one with pictures of the size that the network was trained with"
+    )

@@ -1,0 +1,1 @@
+"""Forecasting while the camera runs."""

@@ -1,0 +1,148 @@
+"""The folder of a trained network: ``model.safetensors`` and ``config.json``.
+
+The weights' file is written first, then the record, which holds its hash: a folder whose two
+files do not belong together is refused, not used.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from face_prediction.errors import RequestError
+from face_prediction.models.interface import PredictorModel
+from face_prediction.models.registry import make_model, settings_class
+from face_prediction.models.tensor_file import read_tensors, write_tensors
+from face_prediction.whole_file import whole_file
+
+SCHEMA = "face_predictor"
+VERSION = 1
+MODEL_FILE = "model.safetensors"
+CONFIG_FILE = "config.json"
+
+
+@dataclass(frozen=True)
+class CheckpointRecord:
+    """What a trained network is, and what it was trained on and how."""
+
+    #: name in the registry
+    model: str
+    #: JSON of its settings
+    settings: dict[str, Any]
+    preset: str
+    #: JSON of the `TrainSettings`
+    training: dict[str, Any]
+    seed: int
+    #: JSON of the dataset's `SequenceSettings`, and the SHA-256 of its ``dataset.json``
+    dataset: dict[str, Any]
+    dataset_sha256: str
+    #: folds by use: train, validation, test
+    folds: dict[str, list[int]]
+    #: the people it was trained on; it must not be judged on them
+    train_subjects: list[str]
+    #: steps that made these weights
+    step: int
+    #: what it got on the fold that was held out, if any; crops and losses
+    validation: dict[str, float]
+    versions: dict[str, str]
+
+
+def library_versions() -> dict[str, str]:
+    """Versions that a network's numbers may depend on."""
+    return {"python": platform.python_version(), "torch": torch.__version__}
+
+
+def save_checkpoint(folder: Path, record: CheckpointRecord, state: Mapping[str, Tensor]) -> None:
+    """Write both files, each whole or not at all.
+
+    Raises:
+        RequestError: the folder cannot be written to.
+    """
+    kind = {"schema": SCHEMA, "version": VERSION}
+    digest = write_tensors(folder / MODEL_FILE, state, kind)
+    data = {**kind, **asdict(record), "model_sha256": digest}
+    with whole_file(folder / CONFIG_FILE) as temporary:
+        text = json.dumps(data, indent=1, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_checkpoint(folder: Path) -> tuple[CheckpointRecord, dict[str, Tensor]]:
+    """Read and check both files.
+
+    Raises:
+        RequestError: one is absent, damaged or of another schema, or they do not belong together.
+    """
+    path = folder / CONFIG_FILE
+    data = _read_config(path)
+    try:
+        names = {item.name for item in fields(CheckpointRecord)}
+        record = CheckpointRecord(**{name: data[name] for name in names})
+        expected = data["model_sha256"]
+    except KeyError as error:
+        raise RequestError(f"{path}: key {error} is missing; train the network again") from None
+    tensors, _, digest = read_tensors(folder / MODEL_FILE)
+    if digest != expected:
+        raise RequestError(
+            f"{folder}: {MODEL_FILE} and {CONFIG_FILE} are not of the same moment; "
+            "give the training command again, which puts that right"
+        )
+    return record, tensors
+
+
+def load_model(folder: Path, device: str = "cpu") -> tuple[PredictorModel, CheckpointRecord]:
+    """The network of a checkpoint, on ``device`` and ready to predict (eval mode).
+
+    Raises:
+        RequestError: as `read_checkpoint`, or the tensors are not those of the network.
+    """
+    record, tensors = read_checkpoint(folder)
+    try:
+        settings = settings_class(record.model).from_json(record.settings)
+    except RequestError as error:
+        raise RequestError(f"{folder / CONFIG_FILE}: {error}") from None
+    model = make_model(record.model, settings)
+    fill(model, tensors, folder / MODEL_FILE)
+    return model.to(device).eval(), record
+
+
+def fill(model: PredictorModel, tensors: Mapping[str, Tensor], source: Path) -> None:
+    """Give a network the tensors that ``source`` holds.
+
+    Raises:
+        RequestError: they are not its own; the first that differs is named.
+    """
+    wanted = model.state_dict()
+    for name in sorted({*wanted, *tensors}):
+        if name not in tensors:
+            raise RequestError(f"{source}: tensor '{name}' is missing")
+        if name not in wanted:
+            raise RequestError(f"{source}: tensor '{name}' is none of this network")
+        if tensors[name].shape != wanted[name].shape or tensors[name].dtype != wanted[name].dtype:
+            raise RequestError(
+                f"{source}: tensor '{name}' is {tensors[name].dtype} {tuple(tensors[name].shape)}, "
+                f"expected {wanted[name].dtype} {tuple(wanted[name].shape)}"
+            )
+    model.load_state_dict(tensors)
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise RequestError(f"{path}: no such file; name a folder written by face-prediction train")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RequestError(f"{path}: damaged ({error}); train the network again") from None
+    schema = data.get("schema") if isinstance(data, dict) else None
+    version = data.get("version") if isinstance(data, dict) else None
+    if (schema, version) != (SCHEMA, VERSION):
+        raise RequestError(
+            f"{path}: schema '{schema}' version {version}, expected '{SCHEMA}' {VERSION}"
+        )
+    return data

@@ -1,0 +1,96 @@
+"""Who is forecast by whom, and whose pictures stand in for whose."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from face_prediction.errors import RequestError
+from face_prediction.evaluation.contestants import common_folds, networks
+from face_prediction.evaluation.selection import exchange_pictures
+from face_prediction.predictor import Forecast, PictureNeeds
+
+
+@dataclass
+class Network:
+    """A network that is never run."""
+
+    name: str
+    test_fold: int
+    preset: str = "cpu"
+    train_subjects: tuple[str, ...] = ("ann",)
+    memory: int | None = 2
+    needs = PictureNeeds(0, 0)
+
+    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
+        raise NotImplementedError
+
+
+def given_networks(*pairs: tuple[str, int, str]) -> list[tuple[Path, Network]]:
+    return [(Path(f"{n}_{fold}_{p}"), Network(n, fold, p)) for n, fold, p in pairs]
+
+
+def test_checkpoints_of_one_network_are_one_row() -> None:
+    rows = networks(given_networks(("a", 1, "cpu"), ("b", 0, "cpu"), ("a", 0, "cpu")))
+    assert [(row.name, row.role, row.folds) for row in rows] == [
+        ("a", "network", (0, 1)),
+        ("b", "network", (0,)),
+    ]
+    assert rows[0].fit.by_fold[1].subjects == {"ann"}
+    assert common_folds(rows) == (0,)
+
+
+def test_two_presets_are_two_rows_that_can_be_told_apart() -> None:
+    rows = networks(given_networks(("a", 0, "cpu"), ("a", 0, "paper"), ("b", 0, "cpu")))
+    assert [row.name for row in rows] == ["a (cpu)", "a (paper)", "b"]
+
+
+def test_the_same_network_twice_for_a_fold_is_refused_by_name() -> None:
+    pairs = [(Path("one"), Network("a", 2)), (Path("two"), Network("a", 2))]
+    with pytest.raises(RequestError, match=r"one and two are both a \(cpu\) for fold 2"):
+        networks(pairs)
+
+
+def test_networks_without_a_common_fold_are_refused() -> None:
+    rows = networks(given_networks(("a", 1, "cpu"), ("a", 2, "cpu"), ("b", 0, "cpu")))
+    with pytest.raises(RequestError, match=r"no fold is covered by all .*a: 1, 2; b: 0"):
+        common_folds(rows)
+
+
+people = st.lists(
+    st.tuples(st.sampled_from(["natural", "grid"]), st.sampled_from("abcde")), min_size=2
+)
+
+
+@given(people, st.integers(0, 5))
+def test_pictures_are_exchanged_within_a_kind_and_nobody_keeps_theirs(
+    who: list[tuple[str, str]], seed: int
+) -> None:
+    kinds = [kind for kind, _ in who]
+    subjects = [kind + name for kind, name in who]
+    if min(Counter(kinds).values()) < 2:
+        with pytest.raises(RequestError, match="one sequence"):
+            exchange_pictures(kinds, subjects, seed)
+        return
+    partner = exchange_pictures(kinds, subjects, seed)
+    assert sorted(partner.tolist()) == list(range(len(who)))
+    assert not np.any(partner == np.arange(len(who)))
+    assert [kinds[p] for p in partner] == kinds
+    for kind in set(kinds):
+        amounts = Counter(s for s, k in zip(subjects, kinds, strict=True) if k == kind)
+        if max(amounts.values()) <= sum(amounts.values()) / 2:
+            own = [subjects[p] == s for p, s, k in zip(partner, subjects, kinds, strict=True) if k == kind]  # noqa: E501  # fmt: skip
+            assert not any(own)
+
+
+def test_the_exchange_follows_from_the_seed() -> None:
+    kinds, subjects = ["natural"] * 40, [f"s{i % 7}" for i in range(40)]
+    first = exchange_pictures(kinds, subjects, 1)
+    np.testing.assert_array_equal(first, exchange_pictures(kinds, subjects, 1))
+    assert np.any(first != exchange_pictures(kinds, subjects, 2))
