@@ -31,6 +31,8 @@ from face_prediction.evaluation import (
     save_error_stats,
 )
 from face_prediction.evaluation.batches import reduction
+from face_prediction.library import load_library
+from face_prediction.library_residuals import library_residuals, shortened
 from face_prediction.predictor import PictureNeeds
 from face_prediction.tracks import NUM_LANDMARKS
 
@@ -54,6 +56,10 @@ class ExportStatsOptions:
     checkpoints: tuple[Path, ...] = ()
     #: A forecaster that is fitted here, instead.
     baseline: str | None = None
+    #: A motion library with forecasts (face-prediction predict), instead: its forecasts are
+    #: measured, one a frame, where the dataset's sequences are ``stride`` frames apart. Clips that
+    #: are in the library are in the dataset, which tells their kind and the size of their crops.
+    library: Path | None = None
     #: Footage to measure on.
     kind: Literal["natural", "head_motion", "grid"] = "natural"
     #: The file to write.
@@ -71,8 +77,25 @@ class ExportStatsOptions:
     depth_m: float = PAPER_CAMERA.depth_m
     #: Whether the file holds the errors themselves, for error "empirical" of the robot's side.
     keep_runs: bool = True
+    #: Forecasts of each clip that the file holds at most; None: all.
+    max_run_frames: int | None = None
     #: Show a progress bar.
     progress: bool = True
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Signed errors (N, H, 2) in crops, where each is from, and what made the forecasts."""
+
+    residuals: NDArray[np.float64]
+    clips: Sequence[str]
+    subjects: Sequence[str]
+    starts: Sequence[int]
+    stride: int
+    predictor: str
+    data_sha256: str
+    #: m that a crop spans at the mouth, the median
+    span: float
 
 
 @dataclass(frozen=True)
@@ -92,40 +115,92 @@ def run_export_stats(options: ExportStatsOptions) -> int:
     """
     given = Camera(options.fov_x_deg, options.fov_y_deg, options.depth_m)
     refuse_other_files(options.out)
+    if options.max_run_frames is not None and options.max_run_frames < 1:
+        raise RequestError(f"--max_run_frames {options.max_run_frames}: 1 or more")
     with FaceDataset(options.dataset) as dataset:
-        fits = cross_fit(dataset, options.checkpoints, options.baseline)
-        found = forecast_all(dataset, fits, options.kind, options.progress)
-        clips = [row.clip for row in found.rows]
-        span = float(np.median(crop_spans(dataset, sorted(set(clips)))))
-        settings = dataset.manifest.settings
-    camera = camera_with_crop(given, span, options.crop_width, options.crop_height)
+        found = (
+            of_dataset(dataset, options)
+            if options.library is None
+            else of_library(dataset, options, options.library)
+        )
+        fps = dataset.manifest.settings.fps
     stats = measure_error_stats(
-        mouth_residuals(found.forecasts, found.truth),
-        clips,
-        [row.subject for row in found.rows],
-        [row.start for row in found.rows],
-        predictor=fits.name,
+        found.residuals,
+        found.clips,
+        found.subjects,
+        found.starts,
+        predictor=found.predictor,
         footage=options.kind,
-        data_sha256=data_hash(found.truth, found.forecasts),
-        stride_frames=settings.stride,
-        fps=settings.fps,
-        camera=camera,
+        data_sha256=found.data_sha256,
+        stride_frames=found.stride,
+        fps=fps,
+        camera=camera_with_crop(given, found.span, options.crop_width, options.crop_height),
         keep_runs=options.keep_runs,
     )
+    if options.max_run_frames is not None:
+        stats = shortened(stats, options.max_run_frames)
     save_error_stats(options.out, stats)
-    logger.info("crops span %.3f m at the mouth (median)", span)
-    folds = sorted({row.fold for row in found.rows})
+    logger.info("crops span %.3f m at the mouth (median)", found.span)
     logger.info(
-        "%s: %s on %d sequences of kind %s, %d subjects, folds %s",
+        "%s: %s on %d forecasts of kind %s, %d subjects",
         options.out,
         stats.predictor,
         stats.sequences,
         stats.footage,
         stats.subjects,
-        ", ".join(map(str, folds)),
     )
     print(table(stats))  # noqa: T201
     return 0
+
+
+def of_dataset(dataset: FaceDataset, options: ExportStatsOptions) -> Measured:
+    """Forecast the dataset's sequences, and measure.
+
+    Raises:
+        RequestError: as `cross_fit` and `forecast_all` do.
+    """
+    fits = cross_fit(dataset, options.checkpoints, options.baseline)
+    found = forecast_all(dataset, fits, options.kind, options.progress)
+    clips = [row.clip for row in found.rows]
+    return Measured(
+        residuals=mouth_residuals(found.forecasts, found.truth),
+        clips=clips,
+        subjects=[row.subject for row in found.rows],
+        starts=[row.start for row in found.rows],
+        stride=dataset.manifest.settings.stride,
+        predictor=fits.name,
+        data_sha256=data_hash(found.truth, found.forecasts),
+        span=float(np.median(crop_spans(dataset, sorted(set(clips))))),
+    )
+
+
+def of_library(dataset: FaceDataset, options: ExportStatsOptions, path: Path) -> Measured:
+    """Measure the forecasts of a library.
+
+    Raises:
+        RequestError: there are others beside, or the library cannot be used.
+    """
+    if options.checkpoints or options.baseline is not None:
+        raise RequestError("--library: holds forecasts; leave --checkpoints and --baseline out")
+    library = load_library(path)
+    kinds = {clip.clip: clip.kind for clip in dataset.manifest.clips if clip.sequences}
+    strange = sorted(set(library.run_clip.tolist()) - set(kinds))
+    if strange:
+        raise RequestError(f"--library {path}: {dataset.folder} has no clip '{strange[0]}'")
+    found = library_residuals(
+        library, {clip for clip, kind in kinds.items() if kind == options.kind}
+    )
+    span = float(np.median(crop_spans(dataset, sorted(set(found.clips)))))
+    return Measured(
+        residuals=found.metres / span,
+        clips=found.clips,
+        subjects=found.subjects,
+        starts=found.starts,
+        stride=1,
+        predictor=str(library.metadata["prediction"]["predictor"]),
+        data_sha256=data_hash(found.metres),
+        span=span,
+    )
 
 
 def forecast_all(dataset: FaceDataset, fits: CrossFit, kind: str, progress: bool) -> Forecasts:

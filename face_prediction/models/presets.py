@@ -24,7 +24,19 @@ _TRAINING = {
     ),
 }
 #: Where a network is trained otherwise than the three published approaches.
-_TRAINING_OF: dict[tuple[str, str], TrainSettings] = {}
+_TRAINING_OF: dict[tuple[str, str], TrainSettings] = {
+    # a step holds eleven origins of each sequence; what is learnt is small beside the fitted prior
+    ("residual", "cpu"): TrainSettings(
+        steps=500,
+        batch_size=16,
+        learning_rate=1e-3,
+        schedule="cosine",
+        warmup_steps=50,
+        ema_decay=0.99,
+        augment=True,
+        validate_every=100,
+    ),
+}
 
 
 def preset_settings(model: str, preset: str) -> tuple[ModelSettings, TrainSettings]:

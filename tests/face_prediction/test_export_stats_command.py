@@ -20,6 +20,7 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.errors import RequestError
 from face_prediction.evaluation import Camera, load_error_stats
 from face_prediction.export_stats_command import ExportStatsOptions, run_export_stats
+from face_prediction.library import MotionLibrary, save_library
 from face_prediction.predictor import Forecast, PictureNeeds
 from face_prediction.tracks import save_track
 from face_prediction.video import sha256_of
@@ -273,3 +274,67 @@ def test_pictures_at_once_fit_in_memory() -> None:
     assert batch_size(PictureNeeds(70, 256)) == 4
     assert batch_size(PictureNeeds(1, 16)) == 64
     assert batch_size(PictureNeeds(1000, 256)) == 1
+
+
+def predicted_library(tmp_path: Path) -> Path:
+    """Two runs of ann and one of nod; forecasts h frames ahead are (h, -2 h, 0) mm off."""
+    frames = (30, 20, 25)
+    mouth = np.cumsum(np.random.default_rng(0).normal(0, 1e-3, (sum(frames), 3)), axis=0)
+    mouth[:, 2] -= DEPTH
+    starts = np.concatenate([[0], np.cumsum(frames)[:-1]])
+    ahead = np.zeros((sum(frames), FUTURE, 3))
+    for start, count in zip(starts, frames, strict=True):
+        for h in range(1, FUTURE + 1):
+            last = start + count - 1
+            come = np.minimum(np.arange(start, start + count) + h, last)
+            ahead[start : start + count, h - 1] = mouth[come] + 1e-3 * np.array([h, -2 * h, 0])
+    library = MotionLibrary(
+        time=np.concatenate([np.arange(n) / 30 for n in frames]),
+        mouth=mouth.astype(np.float32),
+        orientation=np.tile(np.array([1, 0, 0, 0], np.float32), (sum(frames), 1)),
+        jaw=np.full(sum(frames), 0.01, np.float32),
+        run_start=starts,
+        run_length=np.array(frames),
+        run_clip=np.array(["ann", "ann", "nod"]),
+        run_subject=np.array(["ann", "ann", "nod"]),
+        fps=30.0,
+        metadata={"prediction": {"predictor": "made_up"}},
+        predicted_mouth=ahead.astype(np.float32),
+    )
+    path = tmp_path / "library.npz"
+    save_library(path, library)
+    return path
+
+
+def test_a_library_is_measured_frame_by_frame(dataset: Path, tmp_path: Path) -> None:
+    library, out = predicted_library(tmp_path), tmp_path / "stats.json"
+    command = ["export-stats", "--dataset", str(dataset), "--library", str(library)]
+    assert main([*command, "--out", str(out), "--no-progress"]) == 0
+    stats = load_error_stats(out)
+    assert (stats.predictor, stats.stride_frames, stats.subjects) == ("made_up", 1, 1)
+    assert [len(run.values) for run in stats.residuals] == [30 - FUTURE, 20 - FUTURE]
+    with FaceDataset(dataset) as opened:
+        span = float(crop_spans(opened, ["ann"])[0])
+    for h, horizon in enumerate(stats.horizons, start=1):
+        # up in the world is up in the image: V, which counts down, is forecast too far down
+        np.testing.assert_allclose(horizon.bias, np.array([h, 2 * h]) * 1e-3 / span, rtol=1e-3)
+    assert main([*command, "--out", str(out), "--max_run_frames", "30"]) == 0
+    assert [len(run.values) for run in load_error_stats(out).residuals] == [25, 5]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--baseline", "persistence"], "leave --checkpoints and --baseline out"),
+        (["--kind", "grid"], "has no run of the clips"),
+        (["--max_run_frames", "0"], "1 or more"),
+    ],
+)
+def test_a_library_that_cannot_be_measured_is_refused(
+    dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], words: str
+) -> None:
+    library, out = predicted_library(tmp_path), tmp_path / "stats.json"
+    command = ["export-stats", "--dataset", str(dataset), "--library", str(library)]
+    assert main([*command, "--out", str(out), *options]) == 2
+    assert words in caplog.text
+    assert not out.exists()

@@ -1,0 +1,388 @@
+"""The parts of the trainer, each on its own: order, pictures, augmentation, schedule, numbers."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from face_prediction.dataset.split import fold_split
+from face_prediction.errors import RequestError
+from face_prediction.face_geometry import read_canonical_face
+from face_prediction.models.interface import Future, History
+from face_prediction.rigid_pose import rigid_face
+from face_prediction.training import augmentation
+from face_prediction.training.augmentation import (
+    MIDLINE,
+    augment,
+    mirror_indices,
+    mirrored_landmarks,
+    mirrored_pictures,
+    moved_pictures,
+    relit,
+)
+from face_prediction.training.interrupt import StopRequest
+from face_prediction.training.metrics import MetricsLog, RunningMean, draw_curves, read_metrics
+from face_prediction.training.people import choose_people
+from face_prediction.training.pictures import PictureStore
+from face_prediction.training.sampler import Sampler
+from face_prediction.training.seeds import generator, torch_seed
+from face_prediction.training.settings import TrainSettings
+from face_prediction.training.windows import Batch
+
+
+class TestSampler:
+    @given(st.integers(1, 12), st.integers(1, 9), st.integers(0, 2**32))
+    def test_every_epoch_goes_through_all_once(self, count: int, batch: int, seed: int) -> None:
+        sampler = Sampler(count, 10, 10, batch, seed)
+        rows = np.concatenate([sampler.batch(step)[0] for step in range(3 * count)])
+        for epoch in range(3):
+            assert sorted(rows[epoch * count : (epoch + 1) * count]) == list(range(count))
+
+    def test_a_batch_is_a_function_of_seed_and_step(self) -> None:
+        one, other = Sampler(50, 75, 25, 4, 7), Sampler(50, 75, 25, 4, 7)
+        for step in (90, 3, 91, 0, 12):  # in another order, from another object
+            for a, b in zip(one.batch(step), other.batch(step), strict=True):
+                np.testing.assert_array_equal(a, b)
+        different = Sampler(50, 75, 25, 4, 8)
+        assert any(not np.array_equal(one.batch(s)[0], different.batch(s)[0]) for s in range(3))
+
+    def test_epochs_have_orders_of_their_own(self) -> None:
+        sampler = Sampler(20, 10, 10, 20, 0)
+        assert not np.array_equal(sampler.batch(0)[0], sampler.batch(1)[0])
+
+    def test_windows_lie_anywhere_in_the_sequence(self) -> None:
+        sampler = Sampler(5, 75, 25, 50, 0)
+        starts = np.concatenate([sampler.batch(step)[1] for step in range(40)])
+        assert set(starts) == set(range(51))
+        whole = Sampler(5, 75, 75, 50, 0)
+        assert set(whole.batch(3)[1]) == {0}
+
+
+class TestSettings:
+    def test_cosine_goes_from_the_rate_to_a_hundredth_after_warming_up(self) -> None:
+        settings = TrainSettings(
+            steps=110, batch_size=1, learning_rate=1.0, schedule="cosine", warmup_steps=10
+        )
+        rates = [settings.learning_rate_at(step) for step in range(111)]
+        np.testing.assert_allclose(rates[:10], np.arange(1, 11) / 11)
+        assert rates[10] == 1.0
+        assert rates[60] == pytest.approx(0.505)
+        assert rates[110] == pytest.approx(0.01)
+        assert np.all(np.diff(rates[10:]) < 0)
+
+    def test_constant_is_constant(self) -> None:
+        settings = TrainSettings(steps=9, batch_size=1, learning_rate=1e-4)
+        assert {settings.learning_rate_at(step) for step in range(9)} == {1e-4}
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("steps", 0),
+            ("batch_size", 0),
+            ("learning_rate", -1.0),
+            ("learning_rate", float("nan")),
+            ("ema_decay", 1.0),
+            ("schedule", "linear"),
+            ("precision", "fp16"),
+            ("validate_every", 0),
+        ],
+    )
+    def test_values_out_of_range_name_the_option(self, name: str, value) -> None:
+        with pytest.raises(RequestError, match=f"--{name} {value}"):
+            TrainSettings(**{"steps": 1, "batch_size": 1, name: value})
+
+    def test_json_and_back(self) -> None:
+        settings = TrainSettings(steps=3, batch_size=2, augment=True)
+        assert TrainSettings.from_json(json.loads(json.dumps(settings.to_json()))) == settings
+        with pytest.raises(RequestError, match="need the keys"):
+            TrainSettings.from_json({"steps": 3})
+
+
+def test_seeds_differ_by_name_and_place() -> None:
+    seeds = {torch_seed(0, name, place) for name in ("a", "b") for place in range(5)}
+    assert len(seeds | {torch_seed(1, "a", 0)}) == 11
+    assert generator(3, "x", 4).random() == generator(3, "x", 4).random()
+
+
+class TestMirror:
+    def test_it_is_its_own_inverse_and_leaves_the_midline(self) -> None:
+        mirror = mirror_indices()
+        np.testing.assert_array_equal(mirror[mirror], np.arange(468))
+        assert set(np.flatnonzero(mirror == np.arange(468))) == set(MIDLINE)
+
+    def test_it_is_that_of_the_landmarks_the_head_pose_is_fitted_to(self) -> None:
+        face = rigid_face()
+        known = np.flatnonzero(face.weights > 0)
+        np.testing.assert_array_equal(
+            face.vertices[mirror_indices()[known]], face.vertices[known] * (-1, 1, 1)
+        )
+
+    def test_eyes_and_mouth(self) -> None:
+        mirror = mirror_indices()
+        for right, left in ((33, 263), (133, 362), (61, 291), (159, 386), (145, 374), (127, 356)):
+            assert mirror[right] == left
+
+    @pytest.mark.shared
+    def test_it_is_that_of_the_canonical_face(self, shared_dir: Path) -> None:
+        vertices = read_canonical_face(shared_dir / "faces" / "face_landmarker.task").vertices
+        apart = np.linalg.norm(vertices[:, None] - vertices * (-1, 1, 1), axis=-1)
+        np.testing.assert_array_equal(apart.argmin(axis=1), mirror_indices())
+
+
+class TestAugmentation:
+    def batch(self, rows: int = 64) -> Batch:
+        """Faces whose nose tip (landmark 1) and a red pixel are at the same place."""
+        rng = np.random.default_rng(0)
+        landmarks = torch.from_numpy(rng.uniform(0, 1, (rows, 5, 468, 2)).astype(np.float32))
+        pictures = torch.full((rows, 5, 16, 16, 3), 100, dtype=torch.uint8)
+        for row in range(rows):
+            for frame in range(5):
+                x, y = rng.integers(2, 14, size=2)  # so that it is never moved out
+                pictures[row, frame, y, x, 0] = 255
+                landmarks[row, frame, 1] = torch.tensor([(x + 0.5) / 16, (y + 0.5) / 16])
+        return Batch(
+            History(landmarks[:, :3], pictures[:, :3]), Future(landmarks[:, 3:], pictures[:, 3:])
+        )
+
+    def test_landmarks_and_pictures_are_turned_together(self) -> None:
+        for part in augment(self.batch(), np.random.default_rng(0)):
+            red = part.pictures[..., 0].float() - part.pictures[..., 1].float()
+            place = red.flatten(2).argmax(dim=2)
+            seen = torch.stack([place % 16 + 0.5, place // 16 + 0.5], dim=-1) / 16
+            torch.testing.assert_close(part.landmarks[:, :, 1], seen)
+
+    def test_history_and_future_are_turned_together_and_about_half_of_them(
+        self, monkeypatch
+    ) -> None:
+        monkeypatch.setattr(augmentation, "MOVE", 0.0)
+        before = self.batch()
+        after = augment(before, np.random.default_rng(1))
+        is_turned = [
+            torch.isclose(1 - old.landmarks[:, 0, 1, 0], new.landmarks[:, 0, 1, 0])
+            & ~torch.isclose(old.landmarks[:, 0, 1, 0], new.landmarks[:, 0, 1, 0])
+            for old, new in zip(before, after, strict=True)
+        ]
+        assert torch.equal(*is_turned)
+        assert 20 < int(is_turned[0].sum()) < 44  # 3 standard deviations about 32
+
+    def test_a_sequence_is_moved_as_a_whole_by_up_to_two_pixels_here(self) -> None:
+        """0.16 of 16 pixels; on landmark 10, which is its own mirror image."""
+        before = self.batch()
+        moved = []
+        for old, new in zip(before, augment(before, np.random.default_rng(3)), strict=True):
+            u, v = (torch.stack([x.landmarks[:, :, 10, k] for x in (old, new)]) for k in (0, 1))
+            moved.append(16 * (v[1] - v[0]))
+            plain, turned = 16 * (u[1] - u[0]), 16 * (u[1] - (1 - u[0]))
+            assert bool(
+                ((plain - plain.round()).abs() < 1e-4)[:, 0]
+                .logical_or(((turned - turned.round()).abs() < 1e-4)[:, 0])
+                .all()
+            )
+        steps = torch.cat(moved, dim=1)
+        torch.testing.assert_close(steps, steps[:, :1].round().expand_as(steps), atol=1e-4, rtol=0)
+        assert set(steps[:, 0].round().int().tolist()) == {-1, 0, 1}
+
+    def test_what_moves_in_is_black(self) -> None:
+        pictures = (
+            torch.arange(1, 17, dtype=torch.uint8).reshape(1, 1, 4, 4, 1).expand(3, 1, 4, 4, 3)
+        )
+        moves = torch.tensor([[1, 0], [0, -2], [-1, 1]])
+        right, up, both = moved_pictures(pictures, moves)[:, 0, :, :, 0].tolist()
+        assert right == [[0, 1, 2, 3], [0, 5, 6, 7], [0, 9, 10, 11], [0, 13, 14, 15]]
+        assert up == [[9, 10, 11, 12], [13, 14, 15, 16], [0] * 4, [0] * 4]
+        assert both == [[0] * 4, [2, 3, 4, 0], [6, 7, 8, 0], [10, 11, 12, 0]]
+
+    def test_left_and_right_landmarks_change_places(self) -> None:
+        landmarks = torch.rand(2, 1, 468, 2)
+        turned = mirrored_landmarks(landmarks, torch.tensor([True, False]))
+        torch.testing.assert_close(turned[0, 0, 33, 0], 1 - landmarks[0, 0, 263, 0])
+        torch.testing.assert_close(turned[0, 0, 33, 1], landmarks[0, 0, 263, 1])
+        assert torch.equal(turned[1], landmarks[1])
+
+    def test_twice_in_the_mirror_is_as_before(self) -> None:
+        part = self.batch(4).history
+        both = torch.ones(4, dtype=torch.bool)
+        twice = mirrored_landmarks(mirrored_landmarks(part.landmarks, both), both)
+        torch.testing.assert_close(twice, part.landmarks)
+        assert torch.equal(
+            mirrored_pictures(mirrored_pictures(part.pictures, both), both), part.pictures
+        )
+
+    def test_light_is_multiplied_shifted_and_clipped(self) -> None:
+        pictures = torch.tensor([0, 100, 250], dtype=torch.uint8).expand(2, 1, 1, 1, 3)
+        lit = relit(pictures, torch.tensor([1.2, 1.0]), torch.tensor([0.1, -0.02]))
+        assert lit[0].flatten().tolist() == [26, 146, 255]  # 25.5, 145.5, 325.5
+        assert lit[1].flatten().tolist() == [0, 95, 245]  # -5.1, 94.9, 244.9
+
+    def test_all_frames_of_a_sequence_get_the_same_light(self) -> None:
+        after = augment(self.batch(), np.random.default_rng(2))
+        green = torch.cat([part.pictures[..., 1] for part in after], dim=1)
+        frames = green[:, :, 2:14, 2:14]  # all alike, but for what came in at the edges
+        assert torch.equal(frames.amax(dim=(1, 2, 3)), frames.amin(dim=(1, 2, 3)))
+        assert len(frames.amax(dim=(1, 2, 3)).unique()) > 20
+
+
+class FakeDataset:
+    """Pictures that say which frame of which sequence they are; counts what is decoded."""
+
+    def __init__(self, length: int = 10, crop: int = 64) -> None:
+        settings = SimpleNamespace(length=length, crop_size=crop)
+        self.manifest = SimpleNamespace(settings=settings)
+        self.folder = Path("fake")
+        self.decoded: list[tuple[int, int, int]] = []
+
+    def pictures(self, index: int, frames: slice, reduce: int) -> np.ndarray:
+        self.decoded.append((index, frames.start, frames.stop))
+        values = 20 * index + np.arange(frames.start, frames.stop)
+        side = 64 // reduce
+        return np.broadcast_to(values[:, None, None, None], (len(values), side, side, 3))
+
+
+class TestPictures:
+    def test_only_what_is_needed_is_decoded_and_only_once(self) -> None:
+        dataset = FakeDataset()
+        store = PictureStore(dataset, 32, 1e9)  # pyright: ignore[reportArgumentType]
+        for start, stop in ((3, 6), (4, 6), (2, 5), (0, 10), (0, 10)):
+            got = store.read(2, start, stop)
+            assert got.shape == (stop - start, 32, 32, 3)
+            assert got[:, 0, 0, 0].tolist() == list(range(40 + start, 40 + stop))
+        assert dataset.decoded == [(2, 3, 6), (2, 2, 3), (2, 0, 10)]
+
+    def test_beyond_the_memory_it_is_decoded_every_time(self) -> None:
+        dataset = FakeDataset()
+        store = PictureStore(dataset, 32, 2.5 * 10 * 32 * 32 * 3)  # pyright: ignore[reportArgumentType]
+        for _ in range(2):
+            for index in range(4):
+                assert store.read(index, 0, 10)[9, 0, 0, 0] == 20 * index + 9
+        assert [index for index, _, _ in dataset.decoded] == [0, 1, 2, 3, 2, 3]
+
+    @pytest.mark.parametrize("size", [128, 4, 48])
+    def test_a_size_that_jpeg_does_not_give_is_refused(self, size: int) -> None:
+        with pytest.raises(RequestError, match=f"64 pixels, but this network needs {size}"):
+            PictureStore(FakeDataset(), size, 1e9)  # pyright: ignore[reportArgumentType]
+
+
+class FakePeople:
+    """Seven people in four folds, two sequences each."""
+
+    def __init__(self, folds: int = 4) -> None:
+        self.folder = Path("fake")
+        self.manifest = SimpleNamespace(folds=folds)
+        self.owner = [f"p{n % 7}" for n in range(14)]
+        self.fold = [(n % 7) % folds for n in range(14)]
+
+    def split(self, test: int):
+        return fold_split(self.manifest.folds, test)
+
+    def indices(self, folds) -> np.ndarray:
+        return np.array([n for n in range(14) if self.fold[n] in folds], dtype=np.int64)
+
+    def entry(self, index: int):
+        return SimpleNamespace(subject=self.owner[index])
+
+
+class TestPeople:
+    def choose(self, folds: int = 4, **options):
+        given = {"test_fold": 1, "hold_out": "next", "subjects": None, "seed": 0, **options}
+        return choose_people(FakePeople(folds), **given)  # pyright: ignore[reportArgumentType]
+
+    def test_the_next_fold_validates(self) -> None:
+        people = self.choose()
+        assert people.folds == {"train": [0, 3], "validation": [2], "test": [1]}
+        assert people.train.tolist() == [0, 3, 4, 7, 10, 11]
+        assert people.validation.tolist() == [2, 6, 9, 13]
+        assert people.train_subjects == ["p0", "p3", "p4"]
+
+    def test_none_trains_on_all_but_the_test_fold(self) -> None:
+        people = self.choose(hold_out="none")
+        assert people.folds == {"train": [0, 2, 3], "validation": [], "test": [1]}
+        assert people.train_subjects == ["p0", "p2", "p3", "p4", "p6"]
+        assert len(people.validation) == 0
+
+    def test_no_test_fold_trains_on_everybody(self) -> None:
+        people = self.choose(test_fold=None, hold_out="none")
+        assert len(people.train) == 14
+        assert people.folds == {"train": [0, 1, 2, 3], "validation": [], "test": []}
+
+    def test_fewer_subjects_are_the_first_of_one_order(self) -> None:
+        chosen = [set(self.choose(hold_out="none", subjects=n).train_subjects) for n in range(1, 6)]
+        assert [len(names) for names in chosen] == [1, 2, 3, 4, 5]
+        assert all(a < b for a, b in itertools.pairwise(chosen))
+        few = self.choose(hold_out="none", subjects=2)
+        assert {FakePeople().owner[row] for row in few.train} == set(few.train_subjects)
+        assert len(few.train) == 4
+        others = {
+            tuple(self.choose(hold_out="none", subjects=2, seed=s).train_subjects) for s in range(9)
+        }
+        assert len(others) > 1
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"test_fold": 4}, "fold 4: this dataset has folds 0 to 3"),
+            ({"test_fold": None}, "--hold_out none"),
+            ({"subjects": 4}, "--subjects 4: the folds to train on have 3"),
+            ({"subjects": 0}, "--subjects 0"),
+            ({"folds": 2}, "--hold_out none"),
+            ({"folds": 1, "test_fold": 0, "hold_out": "none"}, "nobody to train on"),
+        ],
+    )
+    def test_what_cannot_be_is_refused(self, options, words: str) -> None:
+        with pytest.raises(RequestError, match=words):
+            self.choose(**options)
+
+
+class TestMetrics:
+    def test_means(self) -> None:
+        mean = RunningMean()
+        for value in (1.0, 2.0, 6.0):
+            mean.add({"a": torch.tensor(value), "b": torch.tensor(-value)})
+        carried_on = RunningMean(mean.names, json.loads(json.dumps(mean.rows())))
+        for one in (mean, carried_on):
+            one.add({"a": torch.tensor(7.0), "b": torch.tensor(1.0)})
+            assert one.take() == {"a": 4.0, "b": -2.0}
+            one.add({"a": torch.tensor(5.0), "b": torch.tensor(0.0)})
+            assert one.take() == {"a": 5.0, "b": 0.0}
+
+    def test_lines_after_the_step_are_written_again(self, tmp_path: Path) -> None:
+        log = MetricsLog(tmp_path, 0)
+        for step in (10, 20, 30):
+            log.write("train", step, {"loss": 1 / 3, "nothing": float("nan")})
+        path = tmp_path / "metrics.jsonl"
+        path.write_text(path.read_text() + '{"kind": "trai')  # killed while writing
+        MetricsLog(tmp_path, 20).write("train", 30, {"loss": 9.0})
+        assert read_metrics(path) == [
+            {"kind": "train", "step": 10, "loss": 0.3333333},
+            {"kind": "train", "step": 20, "loss": 0.3333333},
+            {"kind": "train", "step": 30, "loss": 9.0},
+        ]
+
+    def test_curves_are_drawn_even_of_nothing(self, tmp_path: Path) -> None:
+        pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+        log = MetricsLog(tmp_path, 0)
+        draw_curves(tmp_path)
+        log.write("train", 10, {"loss": 0.5})
+        log.write("validation", 10, {"loss": 0.5, "mouth_error": 0.1})
+        draw_curves(tmp_path)
+        assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_first_signal_is_noted_and_a_second_ends() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with StopRequest() as stop:
+        assert not stop.is_made
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.is_made
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
