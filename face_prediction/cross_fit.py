@@ -72,9 +72,9 @@ def cross_fit(dataset: FaceDataset, checkpoints: Sequence[Path], baseline: str |
             "give either --checkpoints (one folder for each fold) or --baseline "
             f"({', '.join(FORECASTERS)})"
         )
-    return (
-        load_networks(dataset, checkpoints) if baseline is None else fit_baseline(dataset, baseline)
-    )
+    if baseline is None:
+        return load_networks(dataset, checkpoints)
+    return fit_baselines(dataset, [baseline], folds_with_people(dataset))[baseline]
 
 
 def load_networks(dataset: FaceDataset, folders: Sequence[Path]) -> CrossFit:
@@ -113,31 +113,40 @@ def load_networks(dataset: FaceDataset, folders: Sequence[Path]) -> CrossFit:
     return CrossFit(names[0], by_fold)
 
 
-def fit_baseline(dataset: FaceDataset, name: str) -> CrossFit:
-    """The baseline ``name`` for every fold with sequences, fitted to all the others.
+def fit_baselines(
+    dataset: FaceDataset, names: Sequence[str], folds: Sequence[int]
+) -> dict[str, CrossFit]:
+    """Each baseline, fitted for each of ``folds`` to the people of all the others.
 
     Raises:
-        RequestError: there is none of that name, or the dataset has one fold only.
+        RequestError: there is no forecaster of a name, or nobody in other folds to fit it to.
     """
-    if name not in FORECASTERS:
-        raise RequestError(f"--baseline '{name}'; there are {', '.join(FORECASTERS)}")
-    every = dataset.indices()
-    landmarks = np.stack([dataset.landmarks(int(i))[..., :2] for i in every])
-    entries = [dataset.entry(int(i)) for i in every]
-    subjects = np.array([entry.subject for entry in entries])
-    folds = np.array([entry.fold for entry in entries])
-    if len(set(folds.tolist())) < 2:
-        raise RequestError(
-            f"{dataset.folder}: all its people are in one fold, so nobody is left to fit to; "
-            "build it with --folds 2 or more"
-        )
-    by_fold: dict[int, Fitted] = {}
-    for fold in sorted(set(folds.tolist())):
-        others = folds != fold
-        known = LandmarkSequences(landmarks[others], tuple(subjects[others].tolist()))
-        predictor = BaselinePredictor(fit_forecaster(name, known))
-        by_fold[fold] = Fitted(predictor, frozenset(known.subjects))
-    return CrossFit(name, by_fold)
+    for name in names:
+        if name not in FORECASTERS:
+            raise RequestError(f"baseline '{name}'; there are {', '.join(FORECASTERS)}")
+    by_fold: dict[str, dict[int, Fitted]] = {name: {} for name in names}
+    # copies of u and v: a view would keep the depth in memory, too
+    frames = [dataset.landmarks(index)[..., :2].copy() for index in range(len(dataset))]
+    for fold in folds:
+        others = set(range(dataset.manifest.folds)) - {fold}
+        known = dataset.indices(folds=others).tolist()
+        if not known:
+            raise RequestError(
+                f"{dataset.folder}: all its people are in fold {fold}, so nobody is left to fit "
+                "the baselines to; build it with --folds 2 or more"
+            )
+        subjects = tuple(dataset.entry(index).subject for index in known)
+        sequences = LandmarkSequences(np.stack([frames[index] for index in known]), subjects)
+        for name in names:
+            predictor = BaselinePredictor(fit_forecaster(name, sequences))
+            by_fold[name][fold] = Fitted(predictor, frozenset(subjects))
+    return {name: CrossFit(name, fitted) for name, fitted in by_fold.items()}
+
+
+def folds_with_people(dataset: FaceDataset) -> list[int]:
+    """The folds that there are sequences of."""
+    clips = dataset.manifest.clips
+    return sorted({clip.fold for clip in clips if clip.sequences and clip.fold is not None})
 
 
 def batch_size(needs: PictureNeeds) -> int:

@@ -7,13 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
-import numpy as np
-
-from face_prediction.cross_fit import CrossFit, Fitted
+from face_prediction.cross_fit import CrossFit, Fitted, fit_baselines
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.errors import RequestError
-from face_prediction.evaluation.baseline_predictor import BaselinePredictor
-from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
 from face_prediction.predictor import Predictor
 
 #: baseline: fitted here. network: trained before. reference: no forecast at all, but what a
@@ -134,23 +130,5 @@ def baselines(dataset: FaceDataset, names: Sequence[str], folds: Sequence[int]) 
         RequestError: there is no forecaster of a name, or nobody in other folds to fit it to.
     """
     wanted = [PERSISTENCE, *(name for name in dict.fromkeys(names) if name != PERSISTENCE)]
-    for name in wanted:
-        if name not in FORECASTERS:
-            raise RequestError(f"--baselines {name}; there are all, {', '.join(FORECASTERS)}")
-    by_fold: dict[str, dict[int, Fitted]] = {name: {} for name in wanted}
-    # copies of u and v: a view would keep the depth in memory, too
-    frames = [dataset.landmarks(index)[..., :2].copy() for index in range(len(dataset))]
-    for fold in folds:
-        others = set(range(dataset.manifest.folds)) - {fold}
-        known = dataset.indices(folds=others).tolist()
-        if not known:
-            raise RequestError(
-                f"{dataset.folder}: all its people are in fold {fold}, so nobody is left to fit "
-                "the baselines to; build it with --folds 2 or more"
-            )
-        subjects = tuple(dataset.entry(index).subject for index in known)
-        sequences = LandmarkSequences(np.stack([frames[index] for index in known]), subjects)
-        for name in wanted:
-            predictor = BaselinePredictor(fit_forecaster(name, sequences))
-            by_fold[name][fold] = Fitted(predictor, frozenset(subjects))
-    return [Contestant(CrossFit(name, by_fold[name]), "baseline") for name in wanted]
+    fits = fit_baselines(dataset, wanted, folds)
+    return [Contestant(fits[name], "baseline") for name in wanted]

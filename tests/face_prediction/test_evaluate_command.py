@@ -260,7 +260,7 @@ def test_only_common_folds_are_compared(dataset: Path, tmp_path: Path, toys) -> 
         (("reader_0", "idler_1"), {}, "no fold is covered by all checkpoints"),
         ((), {"kinds": ("nodding",)}, "--kinds nodding; there are natural, head_motion, grid"),
         ((), {"kinds": ("grid",)}, "no sequence of kind grid"),
-        ((), {"baselines": ("best",)}, "--baselines best; there are all, persistence"),
+        ((), {"baselines": ("best",)}, "baseline 'best'; there are persistence"),
         ((), {"seed": -1}, "--seed -1: 0 or more"),
         ((), {"max_sequences": 1}, "--max_sequences 1: 2 or more"),
         ((), {"detector_model": Path("absent.task")}, "--detector_model absent.task: no such"),
