@@ -139,7 +139,12 @@ def _cells(taken: Taken) -> str:
 def main() -> None:
     """Time and print."""
     parser = argparse.ArgumentParser(description="Time a frame takes a live predictor.")
-    parser.add_argument("--models", nargs="*", default=[PERSISTENCE, *MODELS])
+    parser.add_argument(
+        "--models",
+        nargs="*",
+        default=[PERSISTENCE, *(m for m in MODELS if m != "image_only")],
+        help="that forecast landmarks",
+    )
     parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["cpu", "paper"])
     parser.add_argument("--frames", type=int, default=60, help="timed, of each")
     parser.add_argument("--threads", type=int, default=2, help="of PyTorch")

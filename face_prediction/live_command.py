@@ -173,8 +173,13 @@ def load_forecasting(
             f"--checkpoint {checkpoint}: {what}; name a folder written by face-prediction train, "
             f"or a baseline ({', '.join(FORECASTERS)})"
         )
-    from face_prediction.models.learned import LearnedPredictor  # PyTorch only where it is needed
+    import torch  # only where it is needed
 
+    from face_prediction.models.learned import LearnedPredictor
+
+    # one frame is too little work to share: a second thread gains nothing on an idle machine, and
+    # where the cores are busy its waiting costs several times the frame
+    torch.set_num_threads(1)
     predictor = LearnedPredictor.load(folder)
     settings = SequenceSettings.from_json(predictor.record.dataset)
     if predictor.needs.frames == 0:

@@ -153,7 +153,6 @@ def test_a_truncated_video_leaves_no_file(clip: Path, faces, tmp_path: Path) -> 
         ({"out": Path("/")}, "is a folder"),
         ({"out": Path("film.avi")}, "name an .mp4 file"),
         ({"checkpoint": "ar_landmarks"}, "has parameters; name a --dataset"),
-        ({"checkpoint": "shipped"}, "shipped: no network is in this package; name a folder"),
         ({"checkpoint": "nowhere"}, "no such folder; name a folder written by .* or a baseline"),
     ],
 )
