@@ -8,6 +8,7 @@ PYTHON ?=
 WITH_TORCH ?= 0
 PYTEST_ARGS ?=
 DEMO_DIR ?= dataset/FeedingEnv_demo
+DEMO_RESULTS ?= results/feeding_demo
 BIN := .venv/bin
 ifeq ($(shell uname),Linux)
 export MUJOCO_GL ?= egl
@@ -19,10 +20,12 @@ help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "Options: PYTHON=python3.12 (makes .venv with it), MUJOCO_GL=egl|osmesa|glfw, PYTEST_ARGS='-k name'"
 
-demo: setup opengl ## five scripted feeding episodes and a preview video
+demo: setup opengl ## five scripted feeding episodes, a preview video, and a benchmark in miniature
 	$(BIN)/python bin/Rollout.py FeedingEnv --scripted --num_episodes 5 --out $(DEMO_DIR)
 	$(BIN)/python bin/Dataset.py verify $(DEMO_DIR)
+	$(BIN)/python bin/Benchmark.py feeding --preset smoke --out $(DEMO_RESULTS)
 	@echo "Preview video: $$(ls $(DEMO_DIR)/*.mp4)"
+	@echo "Report: $(DEMO_RESULTS)/report.html"
 
 test: setup opengl ## every test but the slow ones (under 10 minutes on two cores)
 	$(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)

@@ -31,7 +31,8 @@ def fenced(text: str, language: str) -> list[str]:
 
 def commands(text: str) -> list[list[str]]:
     """Return the words of every command in a bash block or between backticks."""
-    lines = [line for block in fenced(text, "bash") for line in block.splitlines()]
+    blocks = [block.replace("\\\n", " ") for block in fenced(text, "bash")]
+    lines = [line for block in blocks for line in block.splitlines()]
     prose = FENCE.sub("", text)
     lines += [code for code in INLINE.findall(prose) if COMMAND.match(code)]
     return [words for line in lines if (words := shlex.split(line, comments=True))]

@@ -14,6 +14,7 @@ MAX_MODULE_LINES = 350
 MAX_SCRIPT_LINES = 40
 # Footage and photographs of people, and other people's model files, are not ours to publish.
 FOOTAGE = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif", ".jpg", ".jpeg", ".heic", ".webp"}
+OURS = {"face_prediction/assets/residual/model.safetensors"}  # docs/face_residual.md says of whom
 MODELS = {".task", ".tflite", ".pt", ".pth", ".onnx", ".safetensors"}
 
 
@@ -41,7 +42,8 @@ def test_no_file_is_too_large_for_git(repository: Path, project_files: list[Path
 
 
 def test_no_footage_and_no_models(project_files: list[Path]) -> None:
-    assert [str(f) for f in project_files if f.suffix.lower() in FOOTAGE | MODELS] == []
+    found = {str(f) for f in project_files if f.suffix.lower() in FOOTAGE | MODELS}
+    assert found - OURS == set()
 
 
 def test_scripts_are_thin(repository: Path, project_files: list[Path]) -> None:

@@ -1,0 +1,1 @@
+"""The benchmark: every arm trained and evaluated on common seeds, see ``docs/benchmark.md``."""

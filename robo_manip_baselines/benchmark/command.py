@@ -1,0 +1,161 @@
+"""``bin/Benchmark.py``: what it does and says."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from robo_manip_baselines.benchmark.arm_file import ARMS, ArmLine, choose_arms, read_arms
+from robo_manip_baselines.benchmark.local import LocalExecutor
+from robo_manip_baselines.benchmark.options import BenchmarkOptions
+from robo_manip_baselines.benchmark.outcome import (
+    summary,
+    videos_to_make,
+    write_outcome,
+    write_results,
+)
+from robo_manip_baselines.benchmark.plan import Plan, make_plan, missing_predictions
+from robo_manip_baselines.benchmark.progress import Progress, spelt
+from robo_manip_baselines.benchmark.schedule import Executor, UnitsFailedError, run_units
+from robo_manip_baselines.benchmark.store import Store
+from robo_manip_baselines.benchmark.unit import Unit
+from robo_manip_baselines.command import EXIT_FAILED
+from robo_manip_baselines.data.files import prepare_folder
+from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
+from robo_manip_baselines.opengl_check import opengl_problem
+
+UNITS = "units"
+
+logger = logging.getLogger(__name__)
+
+
+def benchmark(options: BenchmarkOptions) -> int:
+    """Do what the options ask for.
+
+    Returns:
+        The exit code: 0, or 1 where units failed.
+
+    Raises:
+        RequestError: the request cannot be met.
+    """
+    plan = plan_of(options)
+    store = Store(options.folder / UNITS)
+    units = plan.units(options.part)
+    if options.dry_run:
+        print(overview(plan, units, store, _workers(options, plan)))  # noqa: T201
+        return 0
+    prepare_folder(options.folder)
+    try:
+        with closing(_executor(options, plan, store)) as executor:
+            carry_out(plan, units, store, executor, options)
+    except UnitsFailedError as error:
+        logger.error("%s", error)
+        return EXIT_FAILED
+    return 0
+
+
+def plan_of(options: BenchmarkOptions) -> Plan:
+    """Plan what the options ask for.
+
+    Raises:
+        RequestError: it cannot be done.
+    """
+    env, arms = read_arms(options.arms_file or ARMS / f"{options.benchmark}.yaml")
+    if options.names:
+        arms = choose_arms(arms, options.names)
+    elif not options.arms_file:
+        arms = tuple(arm for arm in arms if not _is_left_out(arm, options))
+    return make_plan(
+        env, arms, options.size, library=options.motion_library, error_stats=options.error_stats
+    )
+
+
+def _is_left_out(arm: ArmLine, options: BenchmarkOptions) -> bool:
+    """Whether nobody has asked for an arm by name and it cannot be had; says so."""
+    if problem := missing_predictions(arm, MotionLibrary.load(options.motion_library)):
+        logger.warning("left out: %s", problem)
+    return bool(problem)
+
+
+def carry_out(
+    plan: Plan,
+    units: Sequence[Unit],
+    store: Store,
+    executor: Executor,
+    options: BenchmarkOptions,
+) -> None:
+    """Do the units, then the videos, then write what it all came to.
+
+    Raises:
+        RequestError: a unit says that the request was wrong.
+        UnitsFailedError: units failed.
+    """
+    is_whole = options.part is None
+    has_videos = is_whole and options.videos and plan.preset.has_videos
+    if has_videos and (problem := opengl_problem()):
+        logger.warning("no videos: %s", problem)
+        has_videos = False
+    workers = executor.workers(plan.preset.threads, plan.preset.gpu_share)
+    later = 2 * len(plan.arms) * plan.video_seconds if has_videos else 0.0
+    with closing(Progress(units, workers, later=later)) as progress:
+        _note_done(progress, units, store)
+        run_units(units, store, executor, progress)
+        if not is_whole:
+            return
+        study = write_results(plan, store, options.folder)
+        videos = videos_to_make(plan, study) if has_videos else {}
+        progress.add(videos)
+        _note_done(progress, tuple(videos), store)
+        run_units(tuple(videos), store, executor, progress)
+    write_outcome(plan, store, study, options.folder, videos, command_line(sys.argv))
+    print(summary(study, options.folder))  # noqa: T201
+
+
+def overview(plan: Plan, units: Sequence[Unit], store: Store, workers: int) -> str:
+    """Say what there is to do."""
+    todo = [unit for unit in units if not store.is_done(unit)]
+    total, left = Counter(unit.kind for unit in units), Counter(unit.kind for unit in todo)
+    progress = Progress(units, workers, bar=False)
+    _note_done(progress, units, store)
+    rows = {
+        "arms": ", ".join(arm.name for arm in plan.arms),
+        **{kind: f"{left[kind]} of {count} units to do" for kind, count in total.items()},
+        "workers": str(workers),
+        "time": f"about {spelt(progress.seconds_left)}, videos apart",
+    }
+    width = max(map(len, rows))
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+
+
+def command_line(argv: Sequence[str]) -> str:
+    """Return the command as it can be typed again."""
+    return shlex.join(["python", f"bin/{Path(argv[0]).name}", *argv[1:]])
+
+
+def _note_done(progress: Progress, units: Sequence[Unit], store: Store) -> None:
+    for unit in units:
+        if note := store.note(unit):
+            progress.ended(unit, float(note["seconds"]))
+
+
+def _executor(options: BenchmarkOptions, plan: Plan, store: Store) -> Executor:
+    if options.executor == "local":
+        return LocalExecutor(store, _workers(options, plan))
+    # Imported here: Ray is needed by nobody else.
+    from robo_manip_baselines.benchmark.ray_cluster import RayExecutor
+
+    return RayExecutor(store, options.address)
+
+
+def _workers(options: BenchmarkOptions, plan: Plan) -> int:
+    """How many units run at once."""
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    return options.num_workers or max(cores // plan.preset.threads, 1)

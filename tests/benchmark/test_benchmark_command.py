@@ -1,0 +1,194 @@
+"""``bin/Benchmark.py`` from outside: what it refuses, what it says, what it leaves."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robo_manip_baselines.benchmark import command
+from robo_manip_baselines.benchmark.arm_file import ARMS
+from robo_manip_baselines.benchmark.command import benchmark, plan_of
+from robo_manip_baselines.benchmark.forecasts import write_library
+from robo_manip_baselines.benchmark.options import EXAMPLE, BenchmarkOptions
+from robo_manip_baselines.benchmark.store import Store
+from robo_manip_baselines.command import parse
+from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
+from robo_manip_baselines.envs.mujoco.motion_check import PREDICTION
+from robo_manip_baselines.errors import RequestError
+
+from .conftest import ARMS as STUB_ARMS
+from .conftest import PRESET, outcome
+
+
+def options(line: str) -> BenchmarkOptions:
+    return parse(BenchmarkOptions, EXAMPLE, args=line.split())
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("feding", "did you mean 'feeding'"),
+        ("feeding --preset gpu", "cpu, paper, smoke"),
+        ("feeding --executor slurm", "local, ray"),
+        ("feeding --shard 3/2", "i from 1 to n"),
+        ("feeding --shard 0/2", "i from 1 to n"),
+        ("feeding --shard half", "'half'"),
+        ("feeding --num_workers 0", "1 or more"),
+        ("feeding --num_episodes 0", "1 or more"),
+        ("feeding --train_seeds 0", "1 or more"),
+        ("feeding --executor ray --num_workers 2", "--executor local"),
+        ("feeding --address auto", "--executor ray"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_one_line(line: str, words: str) -> None:
+    with pytest.raises(RequestError) as refused:
+        options(line)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("feeding --arms current,curent_pred_h2", "did you mean 'current_pred_h2'"),
+        ("feeding --preset smoke --motion_library none.npz", "none.npz"),
+        ("feeding --preset smoke --error_stats none.json", "none.json"),
+        ("feeding --arms_file none.yaml", "none.yaml"),
+    ],
+)
+def test_a_wrong_plan_is_refused_before_anything_is_written(
+    line: str, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(RequestError, match=words):
+        benchmark(options(f"{line} --out {tmp_path / 'out'}"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_arms_are_chosen_by_name_and_from_a_file(tmp_path: Path) -> None:
+    def names(line: str) -> list[str]:
+        return [arm.name for arm in plan_of(options(line)).arms]
+
+    assert names("feeding --preset smoke") == [
+        "current",
+        "current_pred_h2",
+        "current_pred_h2_uniform",
+    ]
+    assert names("feeding --arms baseline current") == ["baseline", "current"]
+    assert names("feeding --arms current,baseline") == ["baseline", "current"]
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("arms: [{name: a}, {name: b, delay: 3}]")
+    assert names(f"mine --preset smoke --arms_file {mine}") == ["a", "b"]
+    assert names(f"mine --preset smoke --arms_file {mine} --arms b") == ["b"]
+
+
+def test_an_arm_that_cannot_be_had_is_left_out_unless_it_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bare = tmp_path / "bare.npz"
+    with np.load(DEFAULT_LIBRARY) as archive:
+        np.savez(bare, **{k: archive[k] for k in archive.files if k != PREDICTION})
+    plan = plan_of(options(f"feeding --motion_library {bare}"))
+    assert len(plan.arms) == 15
+    assert "left out: arm 'current_pred_h2_model'" in caplog.text
+    with pytest.raises(RequestError, match="no predicted mouth"):
+        plan_of(options(f"feeding --arms current_pred_h2_model --motion_library {bare}"))
+    full = tmp_path / "full.npz"
+    write_library(full, None, "persistence")
+    assert len(plan_of(options(f"feeding --motion_library {full}")).arms) == 16
+
+
+def test_a_dry_run_counts_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    line = f"feeding --preset smoke --train_seeds 2 --num_episodes 6 --out {out} --dry_run"
+    assert benchmark(options(line)) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"demonstrations +2 of 2 units", said)
+    assert re.search(r"training +6 of 6 units", said)
+    assert re.search(r"evaluation +12 of 12 units", said)  # 4 and 2 episodes
+    assert not out.exists()
+
+
+@pytest.fixture
+def stub_command(stub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkOptions:
+    """A command whose preset and arms are the stub's."""
+    from robo_manip_baselines.benchmark import options as options_module
+
+    arms = tmp_path / "stub.yaml"
+    arms.write_text(
+        "arms:\n- {name: current, obs: current}\n"
+        "- {name: late, delay: 3, title: 'Prediction, late'}\n"
+        "- {name: ahead, expert: anticipatory}\n"
+    )
+    monkeypatch.setitem(options_module.PRESETS, "smoke", PRESET)
+    monkeypatch.setattr(command.sys, "argv", ["bin/Benchmark.py", "stub", "it's"])
+    return options(f"stub --preset smoke --arms_file {arms} --out {tmp_path / 'out'}")
+
+
+@pytest.mark.long
+def test_shards_and_then_a_call_without_come_to_the_same(
+    stub_command: BenchmarkOptions,
+    reference: dict[str, bytes],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from dataclasses import replace
+
+    out = tmp_path / "out"
+    for part in ("1/2", "2/2"):
+        assert benchmark(replace(stub_command, shard=part)) == 0
+        assert set(outcome(out)) == set()
+    plan = plan_of(stub_command)
+    store = Store(out / "units")
+    assert all(store.is_done(unit) for unit in plan.units())
+    written = {unit.key: store.note(unit) for unit in plan.units()}
+    (out / "tables").mkdir()
+    (out / "tables" / "old.md").write_text("of an earlier benchmark")
+    assert benchmark(stub_command) == 0
+    assert written == {unit.key: store.note(unit) for unit in plan.units()}  # nothing done twice
+    told = capsys.readouterr().out
+    assert "Prediction, late" in told
+    assert str(out / "report.html") in told
+    found = outcome(out)
+    assert found.pop("commands.txt").decode().splitlines()[0] == (
+        "python bin/Benchmark.py stub 'it'\"'\"'s'"
+    )
+    assert b"bin/Benchmark.py stub" in found.pop("report.html")
+    assert found == {name: reference[name] for name in found}
+    assert len(found) == len(reference) - 2
+    assert [arm.name for arm in plan.arms] == [arm.name for arm in STUB_ARMS]
+
+
+@pytest.mark.long
+def test_the_exit_code_says_that_units_failed(
+    stub_command: BenchmarkOptions, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("STUB_FAIL", "--delay")
+    assert benchmark(stub_command) == 1
+    assert outcome(tmp_path / "out") == {}
+    monkeypatch.delenv("STUB_FAIL")
+    assert benchmark(stub_command) == 0
+    assert "report.html" in outcome(tmp_path / "out")
+
+
+def test_help_names_the_options_and_an_example(repository: Path) -> None:
+    said = subprocess.run(
+        [sys.executable, str(repository / "bin" / "Benchmark.py"), "--help"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "MUJOCO_GL": "disabled"},
+        check=True,
+    ).stdout
+    for name in ("--preset", "--arms_file", "--shard", "--executor", "--dry_run", EXAMPLE):
+        assert name in said
+
+
+def test_the_arms_ship_with_the_package() -> None:
+    assert [path.name for path in ARMS.glob("*.yaml")] == ["feeding.yaml"]

@@ -1,0 +1,115 @@
+"""Real demonstrations, trainings, evaluations: killed in the middle, and with files of a user."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from robo_manip_baselines.benchmark.arm_file import ArmLine
+from robo_manip_baselines.benchmark.local import LocalExecutor
+from robo_manip_baselines.benchmark.outcome import write_results
+from robo_manip_baselines.benchmark.plan import make_plan
+from robo_manip_baselines.benchmark.presets import Preset
+from robo_manip_baselines.benchmark.progress import Progress
+from robo_manip_baselines.benchmark.schedule import run_units
+from robo_manip_baselines.benchmark.store import Store
+from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
+from robo_manip_baselines.observation import Corruption
+from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
+from robo_manip_baselines.policy.checkpoint import read_checkpoint
+
+pytestmark = pytest.mark.slow
+
+# Slow enough to be killed on the way: many layers, saved often.
+TRAINING = (
+    *("--steps", "200", "--checkpoint_every", "40", "--log_every", "5", "--batch_size", "4"),
+    *("--hidden_layers", "9", "--dropout", "0.3"),
+)
+PRESET = Preset(
+    train_preset="cpu",
+    cameras=(),
+    demonstrations=2,
+    demonstration_block=1,
+    num_episodes=3,
+    episode_block=3,
+    train_args=TRAINING,
+    num_envs=1,
+)
+ARMS = (ArmLine("a", policy="Mlp", horizon=3, error="uniform", delay=1),)
+TIMEOUT = 300.0  # seconds; hangs fail, slow machines do not
+
+
+def do(out: Path, workers: int) -> None:
+    plan, store = make_plan("FeedingEnv", ARMS, PRESET), Store(out / "units")
+    units = plan.units()
+    with closing(LocalExecutor(store, workers)) as executor:
+        run_units(units, store, executor, Progress(units, workers, bar=False))
+    write_results(plan, store, out)
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_real_units import do
+do(Path({out!r}), 2)
+"""
+
+
+def test_it_comes_to_the_same_as_without(tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    do(whole, 1)
+    program = DRIVER.format(tests=str(Path(__file__).parent), out=str(killed))
+    for pattern, lines in (
+        ("units/training/*/out/metrics.jsonl", 15),
+        ("units/evaluation/*/out/results.jsonl", 1),
+    ):
+        driver = subprocess.Popen([sys.executable, "-c", program])
+        end = time.monotonic() + TIMEOUT
+        while not any(p.read_text().count("\n") >= lines for p in killed.glob(pattern)):
+            assert driver.poll() is None, "it ended before it could be killed"
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        driver.kill()
+        driver.wait()
+        time.sleep(1.0)  # the workers notice, and end
+        assert not list(killed.glob(f"{Path(pattern).parents[1]}/unit.json"))
+    do(killed, 2)
+    assert (killed / "results.jsonl").read_bytes() == (whole / "results.jsonl").read_bytes()
+    (log,) = killed.glob("units/training/*/log.txt")
+    assert log.read_text().count("run folder: out") == 2
+    assert "of them before" in log.read_text()
+
+
+def test_files_from_outside_and_forecasts_reach_the_policy(tmp_path: Path) -> None:
+    stats, library = tmp_path / "my stats.json", tmp_path / "mine.npz"
+    stats.write_bytes(DEFAULT_STATS.read_bytes())
+    shutil.copy(DEFAULT_LIBRARY, library)
+    size = replace(
+        PRESET, num_episodes=1, episode_block=1, train_args=("--steps", "3", "--batch_size", "4")
+    )
+    arms = (
+        ArmLine("erring", policy="Mlp", error="gaussian"),
+        ArmLine("shuffled", policy="Mlp", prediction="shuffled"),
+    )
+    plan = make_plan("FeedingEnv", arms, size, library=library, error_stats=stats)
+    store, units = Store(tmp_path / "units"), plan.units()
+    with closing(LocalExecutor(store, 2)) as executor:
+        run_units(units, store, executor, Progress(units, 2, bar=False))
+    study = write_results(plan, store, tmp_path)
+    assert [figures.arm.name for figures in study.arms] == ["erring", "shuffled"]
+    erring, shuffled = (read_checkpoint(store.folder(run.training) / "out") for run in plan.runs)
+    assert erring.spec.corruption
+    assert erring.spec.corruption.error_stats == "error_stats.json"
+    assert erring.dataset["env_kwargs"]["motion_library"] == "motion_library.npz"
+    assert shuffled.spec.corruption == Corruption("model")
+    assert shuffled.dataset["env_kwargs"]["motion_library"] == "motion_forecast.npz"
+    left = {path.name for unit in units for path in store.folder(unit).iterdir()}
+    assert left == {"out", "unit.json", "log.txt", ".lock"}
