@@ -27,6 +27,8 @@ from robo_manip_baselines.data.schema import ATTRIBUTES, fields_of
 from robo_manip_baselines.data.verify import damage_summary, verify_dataset, verify_file
 from robo_manip_baselines.errors import RequestError
 
+pytestmark = pytest.mark.long
+
 
 def write(
     folder: Path, seed: int = 3, *, success: bool = True, codec: str = "jpeg", **changes: Any

@@ -72,6 +72,7 @@ def test_out_of_reach_is_cut_and_counted(make_track) -> None:
             assert np.abs(mouth[first : first + 31] - mouth[first]).max() <= 0.08 + 1e-9
 
 
+@pytest.mark.long
 @given(seed=st.integers(0, 10_000))
 def test_counts_add_up_and_runs_hold_only_good_frames(make_track, seed: int) -> None:
     random = np.random.default_rng(seed)

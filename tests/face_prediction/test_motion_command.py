@@ -13,6 +13,8 @@ from face_prediction.library import load_library
 from face_prediction.report import BEGIN, END
 from face_prediction.tracks import save_track
 
+pytestmark = pytest.mark.long
+
 TABLE = """clip,subject,ship,licence,source
 steady.mp4,ann,yes,MIT,here
 lively.mp4,bob,yes,CC BY 4.0,there

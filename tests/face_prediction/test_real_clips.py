@@ -16,7 +16,7 @@ from face_prediction.rigid_pose import rigid_face
 from face_prediction.tracks import FaceTrack, load_track
 from face_prediction.video import VideoReader
 
-pytestmark = pytest.mark.shared
+pytestmark = [pytest.mark.shared, pytest.mark.long]
 
 pytest.importorskip(
     "mediapipe", reason="MediaPipe is not installed (extra face_prediction)", exc_type=ImportError

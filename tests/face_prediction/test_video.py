@@ -11,6 +11,8 @@ import pytest
 from face_prediction.errors import RequestError
 from face_prediction.video import VideoReader, require_video, sha256_of
 
+pytestmark = pytest.mark.long
+
 
 def corner(width: int = 80, height: int = 48) -> np.ndarray:
     """A dark picture with a bright red square in its top left corner."""

@@ -92,6 +92,7 @@ def test_a_row_does_not_depend_on_the_others(policy: str) -> None:
     torch.testing.assert_close(together[2:3], model.predict(state[2:3], None), rtol=0, atol=1e-5)
 
 
+@pytest.mark.long
 @every_policy
 def test_a_batch_can_be_learnt_by_heart(policy: str) -> None:
     model = make(policy).train()

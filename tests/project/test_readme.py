@@ -66,6 +66,7 @@ def test_make_targets_exist(readme: str, repository: Path) -> None:
         assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.long
 def test_every_option_of_a_command_is_in_its_help(readme: str, repository: Path) -> None:
     checked = 0
     for words in commands(readme):
