@@ -22,7 +22,7 @@ def run_train(options: TrainOptions) -> int:
         if error.name != "torch":
             raise
         raise RequestError(
-            "training needs PyTorch; pip install 'robo_manip_baselines[train]'"
+            "training needs PyTorch; pip install 'robo_manip_baselines[face-prediction]'"
         ) from None
     return train(options)
 

@@ -87,5 +87,5 @@ def _safetensors() -> _Safetensors:
         return _Safetensors()
     except ImportError:
         raise RequestError(
-            "networks need safetensors; pip install 'robo_manip_baselines[train]'"
+            "networks need safetensors; pip install 'robo_manip_baselines[face-prediction]'"
         ) from None
