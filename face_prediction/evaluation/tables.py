@@ -6,6 +6,7 @@ Legend: R rows, H horizon, G groups of horizons, K levels of coverage.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -240,32 +241,20 @@ def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _error(value: float) -> str:
-    return NOTHING if np.isnan(value) else f"{value:.4f}"
+def _shown(pattern: str, value: float) -> str:
+    return NOTHING if np.isnan(value) else pattern.format(value)
 
 
-def _error2(value: float) -> str:
-    return NOTHING if np.isnan(value) else f"{value:.1e}"
-
-
-def _ssim(value: float) -> str:
-    return NOTHING if np.isnan(value) else f"{value:.3f}"
-
-
-def _signed(value: float) -> str:
-    return NOTHING if np.isnan(value) else f"{value:+.2f}"
-
-
-def _percent(value: float) -> str:
-    return NOTHING if np.isnan(value) else f"{value:+.1f} %"
-
-
-def _gain(value: float) -> str:
-    return NOTHING if np.isnan(value) else f"{value:+.3f}"
+_error = partial(_shown, "{:.4f}")
+_error2 = partial(_shown, "{:.1e}")
+_ssim = partial(_shown, "{:.3f}")
+_signed = partial(_shown, "{:+.2f}")
+_percent = partial(_shown, "{:+.1f} %")
+_gain = partial(_shown, "{:+.3f}")
 
 
 def _share(value: float) -> str:
-    return NOTHING if np.isnan(value) else f"{100 * value:.1f}"
+    return _shown("{:.1f}", 100 * value)
 
 
 def _plain(value: float | None) -> str:
