@@ -14,7 +14,7 @@ ifeq ($(shell uname),Linux)
 export MUJOCO_GL ?= egl
 endif
 
-.PHONY: help demo test test-fast check format setup opengl wheelhouse clean
+.PHONY: help demo test test-fast test-slow check format setup opengl wheelhouse clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -33,6 +33,9 @@ test: setup opengl ## every test but the slow ones (under 10 minutes on two core
 test-fast: export MUJOCO_GL := disabled # so that a test that draws after all is found out
 test-fast: setup ## the tests that need no OpenGL (under a minute)
 	$(BIN)/python -m pytest -n 2 -m "not slow and not long and not gl" $(PYTEST_ARGS)
+
+test-slow: setup opengl ## the tests that take minutes: a Ray cluster, units that are killed
+	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
 check: setup ## format, lint, types
 	$(BIN)/ruff format --check

@@ -24,10 +24,11 @@ from robo_manip_baselines.benchmark.plan import Plan, make_plan, missing_predict
 from robo_manip_baselines.benchmark.progress import Progress, spelt
 from robo_manip_baselines.benchmark.schedule import Executor, UnitsFailedError, run_units
 from robo_manip_baselines.benchmark.store import Store
-from robo_manip_baselines.benchmark.unit import Unit
+from robo_manip_baselines.benchmark.unit import Unit, is_of_other_source
 from robo_manip_baselines.command import EXIT_FAILED
 from robo_manip_baselines.data.files import prepare_folder
 from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
+from robo_manip_baselines.errors import require_choice
 from robo_manip_baselines.opengl_check import opengl_problem
 
 UNITS = "units"
@@ -45,8 +46,16 @@ def benchmark(options: BenchmarkOptions) -> int:
         RequestError: the request cannot be met.
     """
     plan = plan_of(options)
+    if options.reference:
+        require_choice("reference arm", options.reference, [arm.name for arm in plan.arms])
     store = Store(options.folder / UNITS)
     units = plan.units(options.part)
+    if others := sum(is_of_other_source(note) for note in map(store.note, units) if note):
+        logger.warning(
+            "%d of %d units were done by other code of the package, and are used as they are; "
+            "remove '%s' to do them again",
+            *(others, len(units), store.root),
+        )
     if options.dry_run:
         print(overview(plan, units, store, _workers(options, plan)))  # noqa: T201
         return 0
@@ -108,7 +117,7 @@ def carry_out(
         run_units(units, store, executor, progress)
         if not is_whole:
             return
-        study = write_results(plan, store, options.folder)
+        study = write_results(plan, store, options.folder, options.reference)
         videos = videos_to_make(plan, study) if has_videos else {}
         progress.add(videos)
         _note_done(progress, tuple(videos), store)

@@ -7,9 +7,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from robo_manip_baselines.benchmark import work
 from robo_manip_baselines.benchmark.schedule import Outcome
@@ -47,7 +48,7 @@ class LocalExecutor:
     def start(self, unit: Unit) -> None:
         """Start a unit in its folder."""
         folder = self._store.prepare(unit)
-        self._running.append((unit, start_worker(unit, folder, is_scratch=False)))
+        self._running.append((unit, start_worker(unit.document(), folder, is_scratch=False)))
 
     def wait(self) -> Iterable[Outcome]:
         """Wait until a process has ended, for half a second at most."""
@@ -85,15 +86,17 @@ class LocalExecutor:
         return Outcome(unit, problem, process.returncode)
 
 
-def start_worker(unit: Unit, folder: Path, *, is_scratch: bool) -> subprocess.Popen[bytes]:
+def start_worker(
+    document: Mapping[str, Any], folder: Path, *, is_scratch: bool
+) -> subprocess.Popen[bytes]:
     """Start the process of a unit, which ends with this one.
 
     Args:
-        unit: what to do.
+        document: what to do, see ``Unit.document``.
         folder: of the unit, with what it reads.
         is_scratch: whether the folder goes if this process ends before the unit.
     """
-    threads = str(unit.threads)
+    threads = str(document["threads"])
     environment = {
         **os.environ,
         **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads),
@@ -110,7 +113,7 @@ def start_worker(unit: Unit, folder: Path, *, is_scratch: bool) -> subprocess.Po
         )
     if process.stdin:
         with suppress(BrokenPipeError):  # it has failed already: its exit code says so
-            process.stdin.write(json.dumps(unit.document()).encode() + b"\n")
+            process.stdin.write(json.dumps(document).encode() + b"\n")
             process.stdin.flush()
     return process
 

@@ -24,7 +24,7 @@ class BenchmarkOptions:
     """
 
     benchmark: tyro.conf.Positional[str]
-    """Which benchmark: feeding."""
+    """Which benchmark: feeding, delay."""
     preset: str = "cpu"
     """How large: cpu (without images), paper (three cameras, a GPU) or smoke (three minutes)."""
     arms: tuple[str, ...] = ()
@@ -39,6 +39,8 @@ class BenchmarkOptions:
     """File of recorded face motion; the one that ships with the package if not given."""
     error_stats: Path | None = None
     """File of error statistics; the one that ships with the package if not given."""
+    reference: str | None = None
+    """Arm that tables compare the others with; current if not given, or the first one."""
     executor: str = "local"
     """Where the work is done: local (processes of this machine) or ray (a Ray cluster)."""
     address: str | None = None
@@ -71,10 +73,13 @@ class BenchmarkOptions:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the arms; empty for all of the file."""
+        """Names of the arms; empty for all of the file.
+
+        Those of a preset are arms of ``feeding``.
+        """
         given = tuple(name for part in self.arms for name in part.split(",") if name)
-        # The arms that a preset names are those of the package.
-        return given or (() if self.arms_file else PRESETS[self.preset].arms)
+        is_feeding = self.benchmark == "feeding" and self.arms_file is None
+        return given or (PRESETS[self.preset].arms if is_feeding else ())
 
     @property
     def size(self) -> Preset:

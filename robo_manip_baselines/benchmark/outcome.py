@@ -34,13 +34,14 @@ PLOTS = "plots"
 logger = logging.getLogger(__name__)
 
 
-def write_results(plan: Plan, store: Store, out: Path) -> Study:
+def write_results(plan: Plan, store: Store, out: Path, reference: str | None = None) -> Study:
     """Write ``results.jsonl`` and work out the figures.
 
     Args:
         plan: all of whose evaluations are done.
         store: holds them.
         out: folder to write to.
+        reference: arm that the others are compared with, see ``analyse``.
     """
     lines = [
         replace(result, arm=run.arm.name).to_line()
@@ -50,7 +51,7 @@ def write_results(plan: Plan, store: Store, out: Path) -> Study:
     ]
     _write(out / RESULTS, "".join(f"{line}\n" for line in lines))
     described = {arm.name: arm.described for arm in plan.arms}
-    return analyse(read_lines([out / RESULTS], out), described=described)
+    return analyse(read_lines([out / RESULTS], out), reference=reference, described=described)
 
 
 def videos_to_make(plan: Plan, study: Study) -> dict[Unit, Line]:

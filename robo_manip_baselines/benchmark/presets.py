@@ -21,7 +21,7 @@ class Preset:
         num_episodes: evaluation episodes of each trained policy, seeds from 1000.
         episode_block: how many of them are one unit of work.
         train_seeds: trainings of each arm, seeds from 0.
-        arms: names of the arms; empty for all of the file.
+        arms: names of the arms of ``feeding``; empty for all of them.
         train_args: further options of ``bin/Train.py``.
         num_envs: evaluation episodes that run at once in a unit.
         device: where networks are trained and act, ``cpu`` or ``cuda``.

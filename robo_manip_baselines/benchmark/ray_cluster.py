@@ -99,7 +99,7 @@ class RayExecutor:
         task = self._task.options(
             num_cpus=unit.threads, num_gpus=unit.gpus, max_retries=RETRIES, name=unit.folder
         )
-        self._running[task.remote(unit, *given)] = unit
+        self._running[task.remote(unit.document(), *given)] = unit
         self._attempts[unit.key] = self._attempts.get(unit.key, 0) + 1
 
     def wait(self) -> Iterable[Outcome]:
@@ -164,11 +164,14 @@ def _join(ray: Any, address: str | None) -> None:
         ) from error
 
 
-def do_unit(unit: Unit, *given: Mapping[str, bytes]) -> tuple[int, Files, float, str]:
+def do_unit(
+    document: Mapping[str, Any], *given: Mapping[str, bytes]
+) -> tuple[int, Files, float, str]:
     """Do a unit in a folder of its own on whichever node this runs.
 
     Args:
-        unit: what to do.
+        document: what to do, see ``Unit.document``; made where the benchmark was started, so that
+            the node can tell whether it has the same software.
         given: files that it reads.
 
     Returns:
@@ -182,13 +185,13 @@ def do_unit(unit: Unit, *given: Mapping[str, bytes]) -> tuple[int, Files, float,
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).write_bytes(content)
         # In a process of its own, as everywhere: threads are chosen before PyTorch is imported.
-        process = start_worker(unit, folder, is_scratch=True)
+        process = start_worker(document, folder, is_scratch=True)
         try:
             code = process.wait()
         finally:
             _end(process)
         log = (folder / LOG).read_text(encoding="utf-8", errors="replace")
-        note = read_note(folder, unit.key)
+        note = read_note(folder, document["key"])
         if code == 0 and note is None:
             code = 1
         names = note["files"] if note and code == 0 else []

@@ -19,6 +19,8 @@ from typing import Any
 OUT = "out"
 """Folder, in that of the unit, of what it makes."""
 
+PACKAGE = Path(__file__).parents[1]
+
 MOUNTS = {"demonstrations": "demonstrations", "training": "run"}
 """Kind of a unit -> folder in which units that need it find what it made."""
 
@@ -104,8 +106,29 @@ class Unit:
             "name": self.name,
             "work": self.work,
             "settings": dict(self.settings),
+            "threads": self.threads,
             "versions": versions(),
+            "source": source_digest(),
         }
+
+
+def is_of_other_source(note: Mapping[str, Any]) -> bool:
+    """Say whether a unit's document is of a package whose files were others than now."""
+    return note.get("source") != source_digest()
+
+
+@cache
+def source_digest() -> str:
+    """SHA-256 of the package's files: its programs, models, recorded motion, statistics.
+
+    It is no part of the key, or a comment that is mended would cost hours of training.
+    """
+    found = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            found.update(f"{path.relative_to(PACKAGE).as_posix()}\0".encode())
+            found.update(hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
 
 
 @cache

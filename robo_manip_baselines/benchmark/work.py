@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from robo_manip_baselines.benchmark.store import read_note, write_note
-from robo_manip_baselines.benchmark.unit import MOUNTS, OUT, versions
+from robo_manip_baselines.benchmark.unit import MOUNTS, OUT, source_digest, versions
 from robo_manip_baselines.command import run_command
 from robo_manip_baselines.data.files import seed_of
 from robo_manip_baselines.errors import RequestError
@@ -51,7 +51,7 @@ def main() -> int:
         _end(is_scratch)
     document = json.loads(line)
     threading.Thread(target=_end_with_stdin, args=(is_scratch,), daemon=True).start()
-    _require_versions(document["versions"])
+    _require_same_software(document)
     folder = Path.cwd()
     with _locked(folder):
         if read_note(folder, document["key"]):
@@ -154,14 +154,19 @@ def _remove_inputs(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _require_versions(wanted: Mapping[str, str]) -> None:
+def _require_same_software(document: Mapping[str, Any]) -> None:
     here = versions()
-    for name, number in wanted.items():
+    for name, number in document["versions"].items():
         if here[name] != number:
             raise RequestError(
                 f"{name} is {here[name]} here and {number} where the benchmark was started; "
                 "install the same versions everywhere"
             )
+    if document["source"] != source_digest():
+        raise RequestError(
+            "the files of robo_manip_baselines are not those with which the benchmark was started; "
+            "install the same everywhere, or, if they were just edited, start it again"
+        )
 
 
 if __name__ == "__main__":

@@ -19,13 +19,13 @@ from robo_manip_baselines.evaluation.statistics.comparison import SIGNIFICANCE
 from robo_manip_baselines.evaluation.statistics.findings import findings
 from robo_manip_baselines.evaluation.statistics.lines import Selection
 from robo_manip_baselines.evaluation.statistics.study import ArmFigures, Study
-from robo_manip_baselines.evaluation.tables import Cell, Column, Row, Table
+from robo_manip_baselines.evaluation.tables import NOTHING, Cell, Column, Row, Table
 
 
 def findings_table(study: Study) -> Table:
-    """What the paper found, and what became of it here."""
+    """What the paper found, what the further arms ask, and what became of it here."""
     columns = (
-        Column("What the paper finds", ("claim",), is_text=True),
+        Column("Claim", ("claim",), is_text=True),
         Column("Paper", ("paper",)),
         Column("Here", ("here",)),
         Column("95 % interval", ("low", "high")),
@@ -42,19 +42,19 @@ def findings_table(study: Study) -> Table:
         lines = Selection(first, is_success=None if is_success else True, versus=tuple(others))
         cells = (
             Cell(claim.text, (claim.text,)),
-            Cell(text(claim.paper) + unit, (claim.paper,)),
+            Cell(NOTHING if claim.paper is None else text(claim.paper) + unit, (claim.paper,)),
             Cell(text(d.mean) + (unit if d.mean is not None else ""), (d.mean,), lines),
             interval_cell(d.low, d.high, text, lines),
             Cell(str(d.n), (d.n,), lines),
             Cell(finding.verdict, (finding.verdict,), is_strong=True),
         )
-        rows.append(Row(claim.measure, cells))
+        rows.append(Row("Further claims" if claim.paper is None else "The paper's claims", cells))
     notes = (
         "Each is a difference between (means of) arms, episode by episode, on seeds that all of "
         "them have; of times, on episodes that all of them managed. It holds, or does not, where "
         "its interval lies on one side of the limit; otherwise the data cannot tell.",
     )
-    title = "What the paper finds, and what is found here"
+    title = "Claims, and what became of them"
     return Table("findings", title, columns, tuple(rows), notes)
 
 

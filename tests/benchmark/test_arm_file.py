@@ -33,6 +33,15 @@ def test_the_shipped_arms_are_the_papers_twelve_and_four_more() -> None:
     assert {arm.described.group for arm in arms[12:]} == {FURTHER}
 
 
+def test_the_arms_of_delay_are_a_whole_grid_and_share_their_runs_with_feeding() -> None:
+    _, late = read_arms(ARMS / "delay.yaml")
+    cells = [(arm.delay or 0, arm.described.horizon) for arm in late]
+    assert cells == [(delay, horizon) for delay in (0, 4, 8) for horizon in (0, 2, 5)]
+    assert [arm.described.delay for arm in late] == [delay for delay, _ in cells]
+    _, feeding = read_arms(ARMS / "feeding.yaml")
+    assert set(late[:3]) <= set(feeding)
+
+
 def test_the_names_of_the_presets_arms_are_there() -> None:
     _, arms = read_arms(ARMS / "feeding.yaml")
     sizes = {name: len(choose_arms(arms, preset.arms)) for name, preset in PRESETS.items()}

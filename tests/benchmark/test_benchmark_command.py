@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from robo_manip_baselines.benchmark.command import benchmark, plan_of
 from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.options import EXAMPLE, BenchmarkOptions
 from robo_manip_baselines.benchmark.store import Store
+from robo_manip_baselines.benchmark.unit import source_digest
 from robo_manip_baselines.command import parse
 from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.envs.mujoco.motion_check import PREDICTION
@@ -59,6 +61,7 @@ def test_a_wrong_option_is_refused_in_one_line(line: str, words: str) -> None:
         ("feeding --arms current,curent_pred_h2", "did you mean 'current_pred_h2'"),
         ("feeding --preset smoke --motion_library none.npz", "none.npz"),
         ("feeding --preset smoke --error_stats none.json", "none.json"),
+        ("feeding --preset smoke --reference curent", "did you mean 'current'"),
         ("feeding --arms_file none.yaml", "none.yaml"),
     ],
 )
@@ -80,6 +83,7 @@ def test_arms_are_chosen_by_name_and_from_a_file(tmp_path: Path) -> None:
         "current_pred_h2_uniform",
     ]
     assert names("feeding --arms baseline current") == ["baseline", "current"]
+    assert names("delay --preset smoke") == names("delay --preset paper") == names("delay")
     assert names("feeding --arms current,baseline") == ["baseline", "current"]
     mine = tmp_path / "mine.yaml"
     mine.write_text("arms: [{name: a}, {name: b, delay: 3}]")
@@ -167,6 +171,41 @@ def test_shards_and_then_a_call_without_come_to_the_same(
 
 
 @pytest.mark.long
+def test_the_reference_is_chosen_without_doing_anything_again(
+    stub_command: BenchmarkOptions,
+    reference: dict[str, bytes],
+    reference_folder: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    from dataclasses import replace
+
+    out = tmp_path / "out"
+    shutil.copytree(reference_folder / "units", out / "units")
+    assert benchmark(replace(stub_command, reference="late")) == 0
+    table = (out / "tables" / "success_differences.md").read_text()
+    assert "Success against “Prediction, late”" in table
+    assert b"Success against \xe2\x80\x9cCurrent only" in reference["tables/success_differences.md"]
+    assert "other code" not in caplog.text
+
+
+@pytest.mark.long
+def test_units_of_other_code_are_used_and_said_to_be(
+    stub_command: BenchmarkOptions,
+    reference_folder: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(reference_folder / "units", out / "units")
+    note = next((out / "units" / "training").glob("*/unit.json"))
+    note.write_text(note.read_text().replace(source_digest(), "ab" * 32))
+    assert benchmark(stub_command) == 0
+    assert "1 of 13 units were done by other code of the package" in caplog.text
+    assert str(out / "units") in caplog.text
+
+
+@pytest.mark.long
 def test_the_exit_code_says_that_units_failed(
     stub_command: BenchmarkOptions, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -191,4 +230,4 @@ def test_help_names_the_options_and_an_example(repository: Path) -> None:
 
 
 def test_the_arms_ship_with_the_package() -> None:
-    assert [path.name for path in ARMS.glob("*.yaml")] == ["feeding.yaml"]
+    assert {path.name for path in ARMS.glob("*.yaml")} == {"feeding.yaml", "delay.yaml"}

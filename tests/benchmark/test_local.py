@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -131,19 +132,29 @@ def test_the_last_words_of_a_unit_that_fails_are_passed_on(
     assert missing == {"late_seed0", "late_seed0_001000", "late_seed0_001003"}
 
 
-def test_other_versions_are_refused(
-    stub_plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        ({"versions": {"mujoco": "1.2.3"}}, "here and 1.2.3 where the benchmark was started"),
+        ({"source": "ab" * 32}, "are not those with which the benchmark was started"),
+    ],
+)
+def test_other_software_is_refused(
+    stub_plan: Plan,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    other: dict[str, Any],
+    words: str,
 ) -> None:
     store = Store(tmp_path)
     unit = stub_plan.units()[0]
-    told = unit.document()
-    told["versions"] = {**told["versions"], "mujoco": "1.2.3"}
+    told = {**unit.document(), **other}
     monkeypatch.setitem(unit.__dict__, "document", lambda: told)
     executor = LocalExecutor(store, 1)
     executor.start(unit)
     (ended,) = wait(executor)
     assert ended.code == 2
-    assert "here and 1.2.3 where the benchmark was started" in ended.problem
+    assert words in ended.problem
 
 
 def test_a_unit_that_another_process_does_is_waited_for(stub_plan: Plan, tmp_path: Path) -> None:
@@ -166,7 +177,7 @@ def test_a_scratch_folder_goes_with_whoever_started_the_unit(
     monkeypatch.setenv("STUB_PAUSE", "100")
     folder = tmp_path / "scratch"
     (folder / "demonstrations").mkdir(parents=True)
-    process = start_worker(stub_plan.runs[0].training, folder, is_scratch=True)
+    process = start_worker(stub_plan.runs[0].training.document(), folder, is_scratch=True)
     end = time.monotonic() + TIMEOUT
     while not (folder / "out" / "state.json").exists():
         assert time.monotonic() < end

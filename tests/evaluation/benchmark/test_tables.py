@@ -135,7 +135,8 @@ def test_rows_of_the_benchmark(study: Study) -> None:
     assert list(rows_of(tables, "success_differences")) == [a for a in arms if a != "current"]
     assert list(rows_of(tables, "success_beside_paper")) == [a for a in arms if a in PAPER]
     assert list(rows_of(tables, "completion_times_beside_paper")) == [a for a in arms if a in PAPER]
-    assert len(rows_of(tables, "findings")) == 5
+    verdicts = rows_of(tables, "findings")
+    assert [row["paper"] == "" for row in verdicts.values()] == 5 * [False] + [True]
 
     figures = study.arms[0]
     row = rows_of(tables, "success")["baseline"]
