@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -143,8 +144,6 @@ def test_shards_and_then_a_call_without_come_to_the_same(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from dataclasses import replace
-
     out = tmp_path / "out"
     for part in ("1/2", "2/2"):
         assert benchmark(replace(stub_command, shard=part)) == 0
@@ -170,20 +169,22 @@ def test_shards_and_then_a_call_without_come_to_the_same(
     assert [arm.name for arm in plan.arms] == [arm.name for arm in STUB_ARMS]
 
 
+@pytest.fixture
+def done(stub_command: BenchmarkOptions, reference_folder: Path) -> Path:
+    """The folder of the command, with all units done."""
+    shutil.copytree(reference_folder / "units", stub_command.folder / "units")
+    return stub_command.folder
+
+
 @pytest.mark.long
 def test_the_reference_is_chosen_without_doing_anything_again(
     stub_command: BenchmarkOptions,
     reference: dict[str, bytes],
-    reference_folder: Path,
-    tmp_path: Path,
+    done: Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    from dataclasses import replace
-
-    out = tmp_path / "out"
-    shutil.copytree(reference_folder / "units", out / "units")
     assert benchmark(replace(stub_command, reference="late")) == 0
-    table = (out / "tables" / "success_differences.md").read_text()
+    table = (done / "tables" / "success_differences.md").read_text()
     assert "Success against “Prediction, late”" in table
     assert b"Success against \xe2\x80\x9cCurrent only" in reference["tables/success_differences.md"]
     assert "other code" not in caplog.text
@@ -191,18 +192,13 @@ def test_the_reference_is_chosen_without_doing_anything_again(
 
 @pytest.mark.long
 def test_units_of_other_code_are_used_and_said_to_be(
-    stub_command: BenchmarkOptions,
-    reference_folder: Path,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
+    stub_command: BenchmarkOptions, done: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    out = tmp_path / "out"
-    shutil.copytree(reference_folder / "units", out / "units")
-    note = next((out / "units" / "training").glob("*/unit.json"))
+    note = next((done / "units" / "training").glob("*/unit.json"))
     note.write_text(note.read_text().replace(source_digest(), "ab" * 32))
     assert benchmark(stub_command) == 0
     assert "1 of 13 units were done by other code of the package" in caplog.text
-    assert str(out / "units") in caplog.text
+    assert str(done / "units") in caplog.text
 
 
 @pytest.mark.long
