@@ -28,7 +28,7 @@ from robo_manip_baselines.benchmark.unit import Unit, is_of_other_source
 from robo_manip_baselines.command import EXIT_FAILED
 from robo_manip_baselines.data.files import prepare_folder
 from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.errors import require_choice
+from robo_manip_baselines.errors import RequestError, require_choice
 from robo_manip_baselines.opengl_check import opengl_problem
 
 UNITS = "units"
@@ -59,6 +59,8 @@ def benchmark(options: BenchmarkOptions) -> int:
     if options.dry_run:
         print(overview(plan, units, store, _workers(options, plan)))  # noqa: T201
         return 0
+    if options.executor == "local":
+        _require_device(options.preset, plan)
     prepare_folder(options.folder)
     try:
         with closing(_executor(options, plan, store)) as executor:
@@ -151,6 +153,20 @@ def _note_done(progress: Progress, units: Sequence[Unit], store: Store) -> None:
     for unit in units:
         if note := store.note(unit):
             progress.ended(unit, float(note["seconds"]))
+
+
+def _require_device(preset: str, plan: Plan) -> None:
+    """Refuse what no training could be done with, before an hour of demonstrations."""
+    if plan.preset.device == "cpu":
+        return
+    # Imported here: it takes seconds.
+    import torch
+
+    if not torch.cuda.is_available():
+        raise RequestError(
+            f"preset '{preset}' needs a CUDA device, and PyTorch {torch.__version__} finds none; "
+            "take --preset cpu, or --executor ray with a cluster that has GPUs"
+        )
 
 
 def _executor(options: BenchmarkOptions, plan: Plan, store: Store) -> Executor:

@@ -74,6 +74,19 @@ def test_a_wrong_plan_is_refused_before_anything_is_written(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("has_shard", [False, True])
+def test_a_preset_for_a_gpu_is_refused_where_there_is_none(
+    has_shard: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    line = "feeding --preset paper" + " --shard 1/2" * has_shard
+    with pytest.raises(RequestError, match="'paper' needs a CUDA device"):
+        benchmark(options(f"{line} --out {tmp_path / 'out'}"))
+    assert not (tmp_path / "out").exists()
+
+
 def test_arms_are_chosen_by_name_and_from_a_file(tmp_path: Path) -> None:
     def names(line: str) -> list[str]:
         return [arm.name for arm in plan_of(options(line)).arms]
