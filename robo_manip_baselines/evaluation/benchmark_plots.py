@@ -1,7 +1,4 @@
-"""The plots of a benchmark.
-
-World frame seen from in front of the face: y to the right, z up; the person's left is on the right.
-"""
+"""The plots of a benchmark."""
 
 from __future__ import annotations
 
@@ -95,7 +92,10 @@ def completion_times(study: Study) -> Plot:
 
 
 def arrivals(study: Study) -> Plot:
-    """Draw where on the mouth's plane the gripper came nearest, one picture for each arm."""
+    """Draw where on the mouth's plane the cube came nearest, one picture for each arm.
+
+    The face is seen from in front: the person's left is on the right.
+    """
     name, title = "arrivals", "Where on the face the cube arrived"
     columns = min(4, len(study.arms))
     rows = -(-len(study.arms) // columns)
@@ -109,9 +109,9 @@ def arrivals(study: Study) -> Plot:
         for axes, figures in zip(grid.flat, study.arms, strict=False):
             results = [line.result for line in figures.lines]
             at_face = [
-                (1000.0 * r.closest_offset[1], 1000.0 * r.closest_offset[2], r.is_success)
+                (1000.0 * r.cube_offset[1], 1000.0 * r.cube_offset[2], r.is_success)
                 for r in results
-                if r.closest_offset is not None and abs(r.closest_offset[0]) < REACH
+                if r.cube_offset is not None and abs(r.cube_offset[0]) < REACH
             ]
             seen = [p for p in at_face if max(abs(p[0]), abs(p[1])) <= view]
             for is_success, colour, marker in ((False, RED, "x"), (True, GREEN, ".")):
@@ -136,10 +136,10 @@ def arrivals(study: Study) -> Plot:
     return Plot(
         name,
         title,
-        "The gripper with the cube, relative to the mouth, at its closest approach (nearest in "
-        f"units of the tolerances), where that was within {1000 * REACH:.0f} mm along the face's "
-        "normal. Green dots: successes; red crosses: failures; the box: tolerance of "
-        f"±{across:.0f} mm.",
+        "The centre of the cube on the mouth's plane where, held, it was nearest to the mouth, if "
+        f"that was within {1000 * REACH:.0f} mm along the face's normal. Green dots: successes; "
+        f"red crosses: failures; the box: ±{across:.0f} mm, the tolerance that Algorithm 1 gives "
+        "to the gripper behind it.",
         "One scatter plot for each arm; the numbers are in the table of how episodes ended.",
         stream.getvalue(),
     )

@@ -39,6 +39,8 @@ class EpisodeWatch:
         self._distance: float | None = None
         self._offset: Offset | None = None
         self._nearness = np.inf
+        self._cube_offset: Offset | None = None
+        self._cube_distance = np.inf
 
     def see(self, info: Mapping[str, Any]) -> None:
         """Take in the ``info`` of a step."""
@@ -54,6 +56,11 @@ class EpisodeWatch:
             self._nearness = nearness
             x, y, z = offset.tolist()
             self._offset = (x, y, z)
+        cube_distance = float(np.linalg.norm(info["cube_offset"]))
+        if cube_distance < self._cube_distance:
+            self._cube_distance = cube_distance
+            out, across, up = np.asarray(info["cube_offset"]).tolist()
+            self._cube_offset = (out, across, up)
 
     def result(self, info: Mapping[str, Any]) -> EpisodeResult:
         """Return what the episode came to, given the ``info`` of its last step."""
@@ -72,6 +79,7 @@ class EpisodeWatch:
             ),
             closest_distance=self._distance,
             closest_offset=self._offset,
+            cube_offset=self._cube_offset,
             face_force=self._force,
         )
 

@@ -30,6 +30,8 @@ class EpisodeResult:
             without a lift
         closest_offset: m, x, y, z of gripper minus mouth at the closest approach with the cube,
             nearest in units of the tolerances; null without a lift
+        cube_offset: m, cube minus mouth in the face's axes (out, across to the person's left, up)
+            where the lifted cube was held and its centre nearest to the mouth; null without a lift
         face_force: N, largest normal force between robot and face
         motion_clip: recorded clip whose motion the face replayed
         motion_subject: person in that clip
@@ -50,6 +52,7 @@ class EpisodeResult:
     failure: str
     closest_distance: float | None
     closest_offset: Offset | None
+    cube_offset: Offset | None
     face_force: float
     motion_clip: str
     motion_subject: str
@@ -84,8 +87,9 @@ class EpisodeResult:
             raise ValueError(f"'{unknown[0]}' is unknown")
         if values["failure"] and values["failure"] not in FAILURES:
             raise ValueError(f"'failure' is {json.dumps(values['failure'])}")
-        if values["closest_offset"] is not None:
-            values["closest_offset"] = tuple(values["closest_offset"])
+        for name in ("closest_offset", "cube_offset"):
+            if values[name] is not None:
+                values[name] = tuple(values[name])
         return cls(**values)
 
 

@@ -85,8 +85,8 @@ def evaluate(settings):
                 env="FeedingEnv", seed=seed, is_success=ok, is_success_strict=chance % 5 == 0,
                 completion_time=4.0 + chance % 100 / 50 if ok else None, time_since_lift=9.0,
                 steps=600, failure="" if ok else "missed_low", closest_distance=0.02,
-                closest_offset=(0.01, 0.002, -0.004), face_force=1.0, motion_clip="clip",
-                motion_subject="person", policy="Act", arm="stub",
+                closest_offset=(0.01, 0.002, -0.004), cube_offset=None, face_force=1.0,
+                motion_clip="clip", motion_subject="person", policy="Act", arm="stub",
                 train_seed=0, checkpoint=state, versions={"stub": "1"},
             )
             file.write(result.to_line() + "\\n")

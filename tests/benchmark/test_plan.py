@@ -173,7 +173,7 @@ def test_the_shipped_benchmarks_can_be_planned(tmp_path: Path) -> None:
 def test_a_video_acts_one_episode_of_a_training_out() -> None:
     made = plan()
     result = EpisodeResult(
-        "FeedingEnv", 1004, True, True, 4.0, 9.0, 600, "", 0.01, (0.0, 0.0, 0.0), 0.0, "c", "p"
+        "FeedingEnv", 1004, True, True, 4.0, 9.0, 600, "", 0.01, None, None, 0.0, "c", "p"
     )
     video = made.video(made.runs[1], result)
     assert video.needs == (made.runs[1].training,)

@@ -120,7 +120,8 @@ def test_info_has_the_promised_keys_and_types(env: gymnasium.Env[Any, Any]) -> N
     for told in (info, later):
         assert isinstance(told["is_success"], bool)
         assert isinstance(told["is_success_strict"], bool)
-        assert told["mouth_position"].shape == told["gripper_position"].shape == (3,)
+        for name in ("mouth_position", "gripper_position", "cube_offset"):
+            assert told[name].shape == (3,)
         assert told["phase"] == "reach"
         assert told["time_since_lift"] is None
         assert told["completion_time"] is None

@@ -15,6 +15,7 @@ from robo_manip_baselines.envs.mujoco.feeding_success import (
     Facts,
     Phase,
     Progress,
+    from_mouth,
     is_at_mouth,
     is_inside_mouth,
 )
@@ -76,8 +77,10 @@ TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 def test_inside_the_opening(
     axes: np.ndarray, out: float, across: float, up: float, expected: bool
 ) -> None:
-    cube = MOUTH + axes @ np.array([out, across, up])
-    assert is_inside_mouth(cube, MOUTH, axes, 0.025, 0.015) is expected
+    offset = np.array([out, across, up])
+    found = from_mouth(MOUTH + axes @ offset, MOUTH, axes)
+    np.testing.assert_allclose(found, offset, atol=1e-12)
+    assert is_inside_mouth(found, 0.025, 0.015) is expected
 
 
 NOTHING = Facts(

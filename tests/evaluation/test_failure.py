@@ -66,6 +66,7 @@ def info(phase: str, gripper: tuple[float, float, float], **changes: object) -> 
         "phase": phase,
         "gripper_position": np.array(gripper),
         "mouth_position": np.array([0.0, 0.5, 0.35]),
+        "cube_offset": np.array(gripper) - [0.012, 0.5, 0.35],  # ahead of the gripper
         "face_force": 0.0,
         "is_success": False,
         "is_success_strict": False,
@@ -98,6 +99,7 @@ def test_the_closest_approach_counts_only_while_the_cube_is_carried() -> None:
     assert result.time_since_lift == 0.3  # without what floating point adds
     assert result.closest_distance == pytest.approx(np.hypot(0.02, 0.02))
     assert result.closest_offset == pytest.approx((0.02, 0.0, -0.02))
+    assert result.cube_offset == pytest.approx((0.008, 0.0, -0.02))
     assert result.failure == "missed_low"
 
 
@@ -106,12 +108,14 @@ def test_nearest_is_meant_in_units_of_the_tolerances() -> None:
     watch = watched(info("carry", (0.029, 0.5, 0.35)), info("carry", (0.0, 0.5, 0.33)))
     result = watch.result(info("carry", (0.0, 0.5, 0.33)))
     assert result.closest_offset == pytest.approx((0.029, 0.0, 0.0))
+    assert result.cube_offset == pytest.approx((0.017, 0.0, 0.0))
     assert result.closest_distance == pytest.approx(0.02)
 
 
 def test_without_a_lift_there_is_no_closest_approach() -> None:
     result = watched(info("grasp", (0.0, 0.5, 0.35))).result(info("reach", (0.0, 0.5, 0.35)))
     assert (result.closest_distance, result.closest_offset) == (None, None)
+    assert result.cube_offset is None
     assert result.failure == "never_grasped"
 
 

@@ -34,6 +34,7 @@ MISS = EpisodeResult(
     failure="never_grasped",
     closest_distance=None,
     closest_offset=None,
+    cube_offset=None,
     face_force=0.0,
     motion_clip="clip",
     motion_subject="person",

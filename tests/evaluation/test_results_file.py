@@ -31,6 +31,7 @@ MISS = EpisodeResult(
     failure="missed_low",
     closest_distance=0.0123,
     closest_offset=(0.001, -0.002, -0.012),
+    cube_offset=(-0.011, -0.003, -0.01),
     face_force=1.5,
     motion_clip="clip",
     motion_subject="person",
@@ -47,6 +48,7 @@ NEVER = replace(
     failure="never_grasped",
     closest_distance=None,
     closest_offset=None,
+    cube_offset=None,
 )
 HIT = replace(MISS, seed=1002, is_success=True, completion_time=4.0, failure="")
 
@@ -65,6 +67,7 @@ def test_a_line_gives_the_result_back(result: EpisodeResult) -> None:
         ({"seed": True}, "'seed' is true"),
         ({"is_success": 1}, "'is_success' is 1"),
         ({"closest_offset": [0.0, 0.0]}, "'closest_offset' is"),
+        ({"cube_offset": 0.0}, "'cube_offset' is"),
         ({"failure": "bored"}, "'failure' is \"bored\""),
         ({"versions": {"numpy": 2}}, "'versions' is"),
         ({"mood": "good"}, "'mood' is unknown"),

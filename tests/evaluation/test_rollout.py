@@ -158,6 +158,10 @@ def test_a_demonstration_acted_out_again_is_the_success_that_it_was(task: Task) 
     assert result.closest_distance == pytest.approx(nearest, abs=2e-3)
     assert result.closest_offset is not None
     assert (np.abs(result.closest_offset) < MOUTH_TOLERANCE).all()
+    assert result.cube_offset is not None
+    cube = shown.arrays["object_pose"][:, :3]
+    nearest = np.linalg.norm(cube - mouth, axis=1)[carried].min()
+    assert np.linalg.norm(result.cube_offset) == pytest.approx(nearest, abs=2e-3)
 
 
 @pytest.mark.gl

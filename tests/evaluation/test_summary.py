@@ -29,6 +29,7 @@ HIT = EpisodeResult(
     failure="",
     closest_distance=0.010,
     closest_offset=(0.01, 0.0, 0.0),
+    cube_offset=(-0.002, 0.0, 0.0),
     face_force=0.0,
     motion_clip="clip",
     motion_subject="person",

@@ -13,6 +13,7 @@ from robo_manip_baselines.envs.mujoco.face_env import FaceEnv
 from robo_manip_baselines.envs.mujoco.feeding_success import (
     Facts,
     Progress,
+    from_mouth,
     is_at_mouth,
     is_inside_mouth,
 )
@@ -96,6 +97,8 @@ class FeedingEnv(FaceEnv):
     the mouth opening, and since the lift the gripper has not touched lips or face |
     | ``mouth_position`` | (3,) | true mouth (m) |
     | ``gripper_position`` | (3,) | site ``right/gripper`` (m) |
+    | ``cube_offset`` | (3,) | centre of the cube from the mouth (m) in the face's axes: out along
+    its normal, across to the person's left, up |
     | ``phase`` | str | reach, grasp, carry, deliver or release |
     | ``time_since_lift`` | float or None | s; None before |
     | ``completion_time`` | float or None | s from the lift to ``is_success``; None before |
@@ -193,6 +196,12 @@ class FeedingEnv(FaceEnv):
         return self.data.xpos[self._cube_body].copy()
 
     @property
+    def cube_offset(self) -> NDArray[np.float64]:
+        """(3,) m: centre of the cube from the mouth, see ``from_mouth``."""
+        axes = self.data.site_xmat[self._mouth_site].reshape(3, 3)
+        return from_mouth(self.object_position(), self.mouth_track[0], axes)
+
+    @property
     def object_pose(self) -> NDArray[np.float64]:
         """(7,) position (m) and orientation (wxyz) of the cube, world."""
         return self.data.qpos[self._cube_qpos : self._cube_qpos + 7].copy()
@@ -231,6 +240,7 @@ class FeedingEnv(FaceEnv):
             "is_success_strict": progress.is_success_strict,
             "mouth_position": self.mouth_track[0],
             "gripper_position": self.gripper_position,
+            "cube_offset": self.cube_offset,
             "phase": progress.phase.name.lower(),
             "time_since_lift": progress.time_since_lift(self.time),
             "completion_time": progress.completion_time,
@@ -252,16 +262,15 @@ class FeedingEnv(FaceEnv):
         self._face_force = 0.0
 
     def _facts(self) -> Facts:
-        mouth, gripper, cube = self.mouth_track[0], self.gripper_position, self.object_position()
-        axes = self.data.site_xmat[self._mouth_site].reshape(3, 3)
+        mouth, gripper = self.mouth_track[0], self.gripper_position
         half_width, half_height = self.mouth_opening.tolist()
         return Facts(
             time=self.time,
             is_held=bool(self._fingers_on_cube.all()),
             is_touched=bool(self._fingers_on_cube.any()),
-            cube_height=float(cube[2]),
+            cube_height=float(self.object_position()[2]),
             is_at_mouth=is_at_mouth(gripper, mouth),
-            is_inside_mouth=is_inside_mouth(cube, mouth, axes, half_width, half_height),
+            is_inside_mouth=is_inside_mouth(self.cube_offset, half_width, half_height),
             touches_face=self._face_force > 0.0,
             gripper_distance=float(np.linalg.norm(gripper - mouth)),
         )

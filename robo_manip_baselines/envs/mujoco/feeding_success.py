@@ -46,23 +46,31 @@ def is_at_mouth(gripper: NDArray[np.float64], mouth: NDArray[np.float64]) -> boo
     return bool(np.all(np.abs(gripper - mouth) < MOUTH_TOLERANCE))
 
 
+def from_mouth(
+    point: NDArray[np.float64], mouth: NDArray[np.float64], mouth_axes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return (3,) m, a point from the mouth in the face's axes: out, across, up.
+
+    Args:
+        point: (3,) m, world frame.
+        mouth: (3,) m, centre of the opening, world frame.
+        mouth_axes: (3, 3) columns: face normal pointing out, across (to the person's left), up;
+            world frame.
+    """
+    return (point - mouth) @ mouth_axes
+
+
 def is_inside_mouth(
-    cube: NDArray[np.float64],
-    mouth: NDArray[np.float64],
-    mouth_axes: NDArray[np.float64],
-    half_width: float,
-    half_height: float,
+    cube_offset: NDArray[np.float64], half_width: float, half_height: float
 ) -> bool:
     """Whether the centre of the cube is in the mouth opening, past the front of the lips.
 
     Args:
-        cube: (3,) m, world frame.
-        mouth: (3,) m, centre of the opening, world frame.
-        mouth_axes: (3, 3) columns: face normal pointing out, across, up; world frame.
+        cube_offset: (3,) m, its centre from the mouth, see ``from_mouth``.
         half_width: m, of the ellipse that the inner lips span.
         half_height: m, likewise.
     """
-    out, across, up = (cube - mouth) @ mouth_axes
+    out, across, up = cube_offset
     if not -CAVITY_DEPTH <= out <= LIP_DEPTH:
         return False
     return bool((across / half_width) ** 2 + (up / half_height) ** 2 <= 1.0)

@@ -74,6 +74,7 @@ def make_results(
                         ),
                         closest_distance=float(np.linalg.norm(offset)) if offset else None,
                         closest_offset=offset,
+                        cube_offset=offset and (offset[0] - 0.012, *offset[1:]),
                         face_force=0.0,
                         motion_clip=f"clip_{episode % 7}",
                         motion_subject=f"person {episode % 5}",

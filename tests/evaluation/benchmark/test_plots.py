@@ -130,6 +130,7 @@ def test_little_is_drawn_too(make_lines: MakeLines) -> None:
         completion_time=None,
         failure="never_grasped",
         closest_offset=None,
+        cube_offset=None,
     )
     study = analyse([replace(lines[0], result=result)], resamples=50)
     for draw in (success_by_horizon, completion_times, arrivals, failure_kinds):
