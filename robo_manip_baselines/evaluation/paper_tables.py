@@ -21,6 +21,11 @@ from robo_manip_baselines.evaluation.statistics.lines import Selection
 from robo_manip_baselines.evaluation.statistics.study import ArmFigures, Study
 from robo_manip_baselines.evaluation.tables import NOTHING, Cell, Column, Row, Table
 
+ONE_RUN = (
+    "With one training run of each arm, verdicts are about the policies that were trained: the "
+    "intervals leave out how much another run would differ."
+)
+
 
 def findings_table(study: Study) -> Table:
     """What the paper found, what the further arms ask, and what became of it here."""
@@ -53,6 +58,7 @@ def findings_table(study: Study) -> Table:
         "Each is a difference between (means of) arms, episode by episode, on seeds that all of "
         "them have; of times, on episodes that all of them managed. It holds, or does not, where "
         "its interval lies on one side of the limit; otherwise the data cannot tell.",
+        *([] if study.has_many_train_seeds else [ONE_RUN]),
     )
     title = "Claims, and what became of them"
     return Table("findings", title, columns, tuple(rows), notes)

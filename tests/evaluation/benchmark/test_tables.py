@@ -168,3 +168,16 @@ def test_one_training_seed_has_no_columns_for_several(
     assert "by_training_seed" not in to_csv(tables[1])
     assert "bootstrap" not in to_markdown(tables[0])
     assert to_markdown(tables[0]).count("**") == 4  # the title, and the best of one
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("train_seeds", [1, 2])
+def test_verdicts_on_one_training_run_say_so(
+    make_lines: Callable[..., tuple[Line, ...]], train_seeds: int
+) -> None:
+    lines = make_lines(arms=["baseline", "current"], train_seeds=train_seeds, episodes=6)
+    claims = study_tables(analyse(lines, resamples=50))[0]
+    assert claims.name == "findings"
+    assert any("one training run of each arm" in note for note in claims.notes) is (
+        train_seeds == 1
+    )
