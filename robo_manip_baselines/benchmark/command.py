@@ -124,6 +124,7 @@ def carry_out(
         progress.add(videos)
         _note_done(progress, tuple(videos), store)
         run_units(tuple(videos), store, executor, progress)
+    logger.info("writing tables, plots and the report to %s", options.folder)
     write_outcome(plan, store, study, options.folder, videos, command_line(sys.argv))
     print(summary(study, options.folder))  # noqa: T201
 
