@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -64,6 +65,9 @@ class Processes:
         try:
             yield
         finally:
+            # Cycles, as DistributedDataParallel has them, would keep the group's threads until the
+            # interpreter ends, which then aborts now and then.
+            gc.collect()
             dist.destroy_process_group()
 
     def mean(self, values: Tensor) -> Tensor:

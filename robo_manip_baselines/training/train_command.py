@@ -52,9 +52,14 @@ def train(args: Sequence[str]) -> int:
     options = parse_options(args, torch.cuda.is_available())
     device = choose_device(options.device, processes.local_rank)
     prepare_device(device, options.training.compile)
+    with processes.joined(device):
+        # A function of its own: nothing of it must outlive the block and hold on to the processes.
+        return _train(options, device, processes)
+
+
+def _train(options: TrainOptions[Any], device: torch.device, processes: Processes) -> int:
     run = options.folder
     with contextlib.ExitStack() as stack:
-        stack.enter_context(processes.joined(device))
         job = Job.of(options)
         if processes.is_main:
             stack.enter_context(locked(run))

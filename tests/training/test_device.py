@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
+import weakref
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ import torch
 
 from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.training import device as device_module
+from robo_manip_baselines.training import train_command
 from robo_manip_baselines.training.device import autocast_type, choose_device, prepare_device
 from robo_manip_baselines.training.distributed import Processes
 from robo_manip_baselines.training.interrupt import StopRequest
@@ -110,6 +113,35 @@ def test_processes_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("LOCAL_RANK", "1")
     monkeypatch.setenv("MASTER_ADDR", "localhost")
     assert Processes.from_environment() == Processes(3, 4, 1)
+
+
+def test_nothing_that_trained_is_left_when_the_processes_part(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What holds on to the group keeps its threads, and the interpreter aborts at its end."""
+
+    class Network:
+        def __init__(self) -> None:
+            self.itself = self  # a cycle, as DistributedDataParallel has them
+
+    left: list[object] = []
+    made: list[weakref.ref[Network]] = []
+
+    def train(*_: object) -> int:
+        network = Network()
+        made.append(weakref.ref(network))
+        return 0
+
+    monkeypatch.setattr(torch.distributed, "init_process_group", lambda *_: None)
+    monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: left.append(made[0]()))
+    monkeypatch.setattr(train_command, "_train", train)
+    monkeypatch.setattr(Processes, "from_environment", lambda: Processes(1, 2, 1))
+    level = logging.getLogger().level
+    try:
+        assert train_command.train(["Mlp", "--preset", "cpu", "--device", "cpu"]) == 0
+    finally:
+        logging.getLogger().setLevel(level)
+    assert left == [None]
 
 
 def test_seeds_of_streams_differ_and_stay_as_they_are() -> None:
