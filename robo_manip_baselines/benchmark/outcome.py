@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from robo_manip_baselines.benchmark.store import Store
 from robo_manip_baselines.benchmark.unit import Unit, versions
 from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.evaluation.figures import write_plots
-from robo_manip_baselines.evaluation.report.clips import EpisodeVideo, episodes_to_show, read_video
+from robo_manip_baselines.evaluation.report.clips import episodes_to_show, read_video
 from robo_manip_baselines.evaluation.report.data import report_data
 from robo_manip_baselines.evaluation.report.render import write_report
 from robo_manip_baselines.evaluation.results_file import RESULTS, read_results
@@ -74,7 +76,9 @@ def write_outcome(
         videos: units that have drawn episodes.
         command: line that did all this.
     """
-    clips = [clip for unit, line in videos.items() for clip in _clips(store, unit, line)]
+    drawn = [(path, line) for unit, line in videos.items() for path in _videos(store, unit)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV and OpenCV let go of the GIL
+        clips = list(pool.map(lambda video: read_video(*video), drawn))
     preset = plan.preset
     facts = {
         "Command": command,
@@ -122,9 +126,8 @@ def _run(runs: Mapping[tuple[str, int], Run], line: Line) -> Run:
     return runs[line.result.arm, line.result.train_seed or 0]
 
 
-def _clips(store: Store, unit: Unit, line: Line) -> list[EpisodeVideo]:
-    paths = [path for path in store.files(unit).values() if path.suffix == ".mp4"]
-    return [read_video(path, line) for path in paths]
+def _videos(store: Store, unit: Unit) -> list[Path]:
+    return [path for path in store.files(unit).values() if path.suffix == ".mp4"]
 
 
 def _keep_only(folder: Path, written: Sequence[Path]) -> None:
