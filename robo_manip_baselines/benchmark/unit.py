@@ -20,6 +20,7 @@ OUT = "out"
 """Folder, in that of the unit, of what it makes."""
 
 PACKAGE = Path(__file__).parents[1]
+"""Folder of robo_manip_baselines."""
 
 MOUNTS = {"demonstrations": "demonstrations", "training": "run"}
 """Kind of a unit -> folder in which units that need it find what it made."""
