@@ -1,0 +1,118 @@
+"""``evaluate`` from a dataset of drawn faces to its numbers, with toy networks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+
+from face_prediction.dataset.reader import FaceDataset
+from face_prediction.evaluate_command import EvaluateOptions
+from face_prediction.forecast.mouth import mouth_centre
+
+from .conftest import rows_of, run
+
+pytestmark = pytest.mark.long
+
+
+def test_baselines_alone(dataset: Path, tmp_path: Path, capsys) -> None:
+    record = run(dataset, tmp_path, baselines=("constant_velocity",))
+    # 33 frames: starts 0, 4, ... 20
+    assert {k: v["sequences"] for k, v in record["kinds"].items()} == {
+        "natural": 18, "head_motion": 12,
+    }  # fmt: skip
+    rows = rows_of(record)
+    assert list(rows) == ["persistence", "constant_velocity"]
+    with FaceDataset(dataset) as opened:
+        frames = [opened.landmarks(int(i))[:, :, :2] for i in opened.indices(kinds={"natural"})]
+    mouth = mouth_centre(np.stack(frames))
+    expected = np.abs(mouth[:, 8:] - mouth[:, 7:8]).mean(axis=0)
+    found = rows["persistence"]["numbers"]["mean"]["value"]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    expected = np.linalg.norm(
+        mouth[:, 8:] - mouth[:, 7:8] - (mouth[:, 7] - mouth[:, 6])[:, None] * np.c_[1:6], axis=-1
+    )
+    found = rows["constant_velocity"]["numbers"]["distance"]["value"]
+    np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-4)
+    assert 0.5 < rows["persistence"]["numbers"]["pooled_ssim"]["value"] < 0.999
+    assert "ssim" not in rows["constant_velocity"]["numbers"]
+    assert record["kinds"]["natural"]["ssim_size"] == 64
+    assert "| persistence | 0.0" in capsys.readouterr().out
+
+
+def test_networks_beside_baselines(dataset: Path, tmp_path: Path, toys) -> None:
+    names = ("reader_0", "idler_1", "idler_0", "reader_1")
+    record = run(dataset, tmp_path, *names, shuffle_pictures=True)
+    rows = rows_of(record)
+    assert list(rows) == ["persistence", "line", "reader", "idler"]
+    assert record["folds"] == [0, 1]
+    assert [c["folder"] for c in record["checkpoints"]] == list(names)
+    # the idler is persistence, at half the size: the same pictures, the same numbers
+    for key in ("mean", "pooled_ssim"):
+        assert rows["idler"]["numbers"][key] == rows["persistence"]["numbers"][key]
+    assert record["kinds"]["natural"]["ssim_size"] == 32
+    assert "ssim_own_size" not in rows["idler"]["numbers"]
+    # the reader copies the last picture, too: what is beside it at its own size is the same
+    numbers = rows["reader"]["numbers"]
+    assert numbers["ssim_own_size"] == numbers["ssim_copy_own_size"]
+    assert numbers["pooled_ssim"]["value"] == pytest.approx(
+        rows["persistence"]["numbers"]["pooled_ssim"]["value"], abs=0.02
+    )
+    # planted information: who reads the pictures gets worse, who does not is not touched
+    assert numbers["exchanged"]["value"][0] > 100.0
+    assert rows["idler"]["numbers"]["exchanged"] == {
+        "value": [0.0] * 3, "low": [0.0] * 3, "high": [0.0] * 3,
+    }  # fmt: skip
+    assert "exchanged" not in rows["line"]["numbers"]
+    # a scale of 0.05 crops around errors of 0.02 or so
+    assert numbers["pooled_coverage"]["value"][-1] > 0.9
+
+
+def test_the_same_command_gives_the_same_bytes(dataset: Path, tmp_path: Path, toys) -> None:
+    for name in ("a", "b"):
+        run(dataset, tmp_path / name, "reader_0", max_sequences=5, shuffle_pictures=True)
+    for path in (tmp_path / "a").iterdir():
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+    record = run(dataset, tmp_path / "c", "reader_0", max_sequences=5, seed=1)
+    assert record["kinds"]["natural"]["sequences"] == 5
+    assert "Of each kind at most 5 sequences" in (tmp_path / "c" / "tables.md").read_text()
+
+
+def test_a_network_of_pictures_only_is_looked_at_by_the_detector(
+    dataset: Path, tmp_path: Path, toys
+) -> None:
+    rows = rows_of(run(dataset, tmp_path, "blind_0", "blind_1"))
+    assert list(rows)[-2:] == ["blind", "detector on the true pictures"]
+    blind, reader = rows["blind"], rows_of(run(dataset, tmp_path, "reader_0", "reader_1"))["reader"]
+    assert sum(blind["missing"]) == 0
+    np.testing.assert_allclose(
+        blind["numbers"]["mean"]["value"], reader["numbers"]["mean"]["value"], atol=0.003
+    )
+    # the truth shows every dot where it is
+    truth = rows["detector on the true pictures"]
+    assert truth["role"] == "reference"
+    assert truth["numbers"]["pooled_distance"]["value"] < 0.02
+
+
+def test_only_common_folds_are_compared(dataset: Path, tmp_path: Path, toys) -> None:
+    record = run(dataset, tmp_path, "reader_0", "idler_0", "idler_1", kinds=("natural",))
+    assert record["folds"] == [0]
+    with FaceDataset(dataset) as opened:
+        count = len(opened.indices(folds={0}, kinds={"natural"}))
+    assert record["kinds"]["natural"]["sequences"] == count < 18
+    notes = " ".join(record["notes"])
+    assert "1 of the dataset's 2 folds" in notes
+    assert "idler also has fold 1" in notes
+
+
+def test_the_command_line(capsys) -> None:
+    given = tyro.cli(
+        EvaluateOptions,
+        args=["--dataset", "d", "--checkpoints", "a", "b", "--no-figures",
+              "--max_sequences", "9"],
+    )  # fmt: skip
+    assert given == EvaluateOptions(
+        Path("d"), (Path("a"), Path("b")), figures=False, max_sequences=9
+    )

@@ -1,0 +1,90 @@
+"""What ``evaluate`` refuses: wrong options, people trained on, other datasets, other pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import face_prediction.evaluate_command as command
+from face_prediction.cli import main
+from face_prediction.errors import RequestError
+from face_prediction.evaluation.provenance import load_checkpoint
+
+from .conftest import run
+
+pytestmark = pytest.mark.long
+
+
+@pytest.mark.parametrize(
+    ("checkpoints", "options", "message"),
+    [
+        (("reader_0", "idler_1"), {}, "no fold is covered by all checkpoints"),
+        ((), {"kinds": ("nodding",)}, "--kinds nodding; there are natural, head_motion, grid"),
+        ((), {"kinds": ("grid",)}, "no sequence of kind grid"),
+        ((), {"baselines": ("best",)}, "baseline 'best'; there are persistence"),
+        ((), {"seed": -1}, "--seed -1: 0 or more"),
+        ((), {"max_sequences": 1}, "--max_sequences 1: 2 or more"),
+        ((), {"detector_model": Path("absent.task")}, "--detector_model absent.task: no such"),
+    ],
+)
+def test_bad_requests(dataset: Path, tmp_path: Path, toys, checkpoints, options, message) -> None:
+    with pytest.raises(RequestError, match=message):
+        run(dataset, tmp_path / "out", *checkpoints, **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_who_was_trained_on_is_not_judged_on(
+    dataset: Path, tmp_path: Path, toys, monkeypatch
+) -> None:
+    monkeypatch.setattr(command, "baselines", None)  # refused before anything takes time
+    toys["reader_0"].train_subjects += ("ann", "bob", "cat", "dan", "eve")
+    with pytest.raises(RequestError, match=r"reader: what forecasts fold 0 was trained on subject"):
+        run(dataset, tmp_path, "reader_0")
+    toys["idler_0"].test_fold = 7
+    with pytest.raises(RequestError, match=r"idler is for fold 7; .* has folds 0 to 1"):
+        run(dataset, tmp_path, "idler_0")
+
+
+def test_every_single_forecast_is_checked(dataset, tmp_path: Path, toys, monkeypatch) -> None:
+    """Even where the check before all others has been forgotten."""
+    monkeypatch.setattr(command, "require_unseen", lambda *_: None)
+    toys["idler_1"].train_subjects += ("ann", "bob", "cat", "dan", "eve")
+    with pytest.raises(RequestError, match="idler: what forecasts fold 1 was trained on subject"):
+        run(dataset, tmp_path, "idler_1", max_sequences=2)
+
+
+def test_a_network_for_other_pictures_is_refused(dataset: Path, tmp_path: Path, toys) -> None:
+    toys["reader_0"].size = 256
+    with pytest.raises(RequestError, match="pictures of 256 pixels: this dataset can give 64, 32"):
+        run(dataset, tmp_path, "reader_0")
+
+
+def test_a_dataset_with_one_fold_has_nobody_to_fit_to(dataset: Path, tmp_path: Path) -> None:
+    root = dataset.parent
+    words = ["build-dataset", root / "tracks", "--videos", root / "videos", "--folds", 1]
+    words += ["--history", 8, "--future", 5, "--stride", 4, "--crop_size", 64, "--no_progress"]
+    assert main([*map(str, words), "--out", str(tmp_path / "one")]) == 0
+    with pytest.raises(RequestError, match="nobody is left to fit"):
+        run(tmp_path / "one", tmp_path / "out")
+
+
+def test_a_checkpoint_of_another_dataset_is_refused(tmp_path: Path, monkeypatch) -> None:
+    learned = pytest.importorskip("face_prediction.models.learned")
+
+    @dataclass
+    class Record:
+        dataset_sha256: str
+
+    @dataclass
+    class Loaded:
+        record: Record
+
+    monkeypatch.setattr(
+        learned.LearnedPredictor, "load", classmethod(lambda cls, folder: Loaded(Record("a" * 64)))
+    )
+    with pytest.raises(
+        RequestError, match=r"net: was trained with another dataset .*aaaa, not bbb"
+    ):
+        load_checkpoint(Path("net"), "b" * 64)

@@ -1,0 +1,82 @@
+"""Figures and the video of ``evaluate``: there, drawn, and the truth where it belongs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from face_prediction.dataset.clip_file import open_clip, read_array
+from face_prediction.dataset.reader import FaceDataset
+from face_prediction.evaluation.clip_story import clip_story
+from face_prediction.evaluation.clip_video import FORECASTS, PAUSE, draw_story
+from face_prediction.forecast.mouth import mouth_centre
+
+from .conftest import SIZE, red_dots, run
+
+pytestmark = pytest.mark.long
+
+
+def shown(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return np.asarray(image)
+
+
+def test_figures_and_video(dataset: Path, tmp_path: Path, toys) -> None:
+    options = {"figures": True, "kinds": ("natural",)}
+    run(dataset, tmp_path, "reader_0", "reader_1", "careless_0", "careless_1", **options)
+    drawn = sorted(path.name for path in tmp_path.iterdir() if path.suffix in (".png", ".mp4"))
+    assert drawn == [
+        "calibration.png", "errors.png", "forecast.mp4", "forecast_natural_persistence.png",
+        "forecast_natural_reader.png",
+    ]  # fmt: skip
+    for name in drawn[:2] + drawn[3:]:
+        assert shown(tmp_path / name).std() > 10
+    # mouth landmarks are drawn in green
+    image = shown(tmp_path / "forecast_natural_reader.png")
+    assert np.sum((image[..., 1] > 200) & (image[..., 0] < 60) & (image[..., 2] < 60)) > 100
+    with av.open(str(tmp_path / "forecast.mp4")) as video:
+        assert video.streams.video[0].codec_context.name == "h264"
+        frames = sum(1 for _ in video.decode(video=0))
+    # six sequences four frames apart: eight frames, four each, the five forecast at the end
+    assert frames == 8 + 5 * 4 + 5
+
+
+def test_the_story_of_a_clip_is_told_in_its_own_pixels(dataset: Path) -> None:
+    with FaceDataset(dataset) as opened:
+        indices = [i for i in range(len(opened)) if opened.entry(i).clip == "two"]
+        path = dataset / "clips" / "two.h5"
+        with open_clip(path) as file:
+            landmarks = read_array(path, file, "frames/landmarks")
+        true = mouth_centre(landmarks) * SIZE
+        exact, off = np.zeros((len(indices), 5, 2)), np.array([0.1, -0.2])
+        story = clip_story(opened, indices, [("exact", exact), ("off", exact + off)])
+    np.testing.assert_allclose(story.mouth, true[story.frames], atol=1e-3)
+    assert story.frames.tolist() == list(range(33))
+    assert story.origins.tolist() == [7, 11, 15, 19, 23, 27]
+    forecasts = story.forecasts[0][1]
+    for origin, ahead in zip(story.origins, forecasts, strict=True):
+        np.testing.assert_allclose(ahead, true[origin + 1 : origin + 6], atol=1e-3)
+    for crop, apart in zip(story.crops[7::4], story.forecasts[1][1] - forecasts, strict=False):
+        np.testing.assert_allclose(apart, np.tile(crop.side * off, (5, 1)))
+    # and the pictures lie where they were cut: the dot is at the mouth
+    for frame, picture, crop in zip(story.frames, story.pictures, story.crops, strict=True):
+        dot = red_dots(picture) * crop.side + (crop.left, crop.top)
+        np.testing.assert_allclose(dot, true[frame], atol=1.5)
+    story = replace(story, forecasts=story.forecasts[:1])
+    images = list(draw_story(story))
+    assert [image.shape for image in images] == [(560, 1280, 3)] * 33
+    # a forecast appears in the plots at the frame it is made at, not before; the truth then comes
+    # to lie on it, since this one is exact
+    orange = [np.all(image[:, 560:] == FORECASTS[0], axis=-1).sum() for image in images]
+    assert orange[0] == orange[6] < orange[8] < orange[7]
+    assert orange[-1] == orange[0]
+    # and where there is time, the video stops at each
+    sparse = [(name, forecast[::2]) for name, forecast in story.forecasts]
+    slow = replace(story, origins=story.origins[::2], forecasts=sparse)
+    assert sum(1 for _ in draw_story(slow)) == 33 + 3 * PAUSE
