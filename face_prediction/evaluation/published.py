@@ -9,9 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Frames 71 to 75
-FRAMES = (71, 72, 73, 74, 75)
-
 
 @dataclass(frozen=True)
 class PublishedRow:

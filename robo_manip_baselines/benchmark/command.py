@@ -135,9 +135,11 @@ def overview(plan: Plan, units: Sequence[Unit], store: Store, workers: int) -> s
     total, left = Counter(unit.kind for unit in units), Counter(unit.kind for unit in todo)
     progress = Progress(units, workers, bar=False)
     _note_done(progress, units, store)
+    spent = sum(float(note["seconds"]) for note in map(store.note, units) if note)
     rows = {
         "arms": ", ".join(arm.name for arm in plan.arms),
         **{kind: f"{left[kind]} of {count} units to do" for kind, count in total.items()},
+        "done": f"{spelt(spent)} of work, videos apart",
         "workers": str(workers),
         "time": f"about {spelt(progress.seconds_left)}, videos apart",
     }

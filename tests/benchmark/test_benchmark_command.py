@@ -204,6 +204,18 @@ def test_the_reference_is_chosen_without_doing_anything_again(
 
 
 @pytest.mark.long
+def test_a_dry_run_adds_up_what_is_done(
+    stub_command: BenchmarkOptions, done: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for note in (done / "units" / "training").glob("*/unit.json"):
+        note.write_text(re.sub(r'"seconds": [\d.]+', '"seconds": 3600.0', note.read_text()))
+    assert benchmark(replace(stub_command, dry_run=True)) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"training +0 of 3 units", said)
+    assert re.search(r"done +3 h 0\d min of work", said)
+
+
+@pytest.mark.long
 def test_units_of_other_code_are_used_and_said_to_be(
     stub_command: BenchmarkOptions, done: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -1,0 +1,86 @@
+"""Whether the arms of a benchmark fail in the same episodes, and how far from success, and how much
+the recorded mouths move.
+
+    python benchmarks/feeding_failures.py docs/results/feeding-cpu/results.jsonl
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from robo_manip_baselines.envs.mujoco.feeding_success import MOUTH_TOLERANCE
+from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
+from robo_manip_baselines.evaluation.result import EpisodeResult
+from robo_manip_baselines.evaluation.statistics.lines import read_lines
+
+BLIND = "baseline"
+"""Arm that knows nothing of the mouth where there are no images."""
+
+SHORT = 0.006
+"""m beyond the tolerance along x at which a gripper that aims well has nearly arrived."""
+
+MANY = 8
+"""Arms that fail in an episode from which it is called hard."""
+
+
+def is_short(result: EpisodeResult) -> bool:
+    """Whether the gripper let go in front of the mouth, just beyond the tolerance."""
+    if result.failure != "dropped" or result.closest_offset is None:
+        return False
+    out, *beside = np.abs(result.closest_offset)
+    limit, *tolerance = MOUTH_TOLERANCE
+    return bool(limit <= out < limit + SHORT and np.less(beside, tolerance).all())
+
+
+def failures(results: Sequence[EpisodeResult]) -> None:
+    """Print in which episodes arms fail, and how many let go just in front of the mouth."""
+    seeing = [r for r in results if r.arm != BLIND]
+    failed = Counter(r.seed for r in seeing if not r.is_success)
+    hard = [count for count in failed.values() if count >= MANY]
+    print(
+        f"{failed.total()} failures of {len({r.arm for r in seeing})} arms, "
+        f"{sum(hard) / failed.total():.0%} of them in {len(hard)} episodes "
+        f"in which {MANY} or more fail"
+    )
+    dropped = [r for r in seeing if r.failure == "dropped"]
+    print(
+        f"{len(dropped)} dropped, {sum(map(is_short, dropped))} of them let go within "
+        f"{1000 * SHORT:.0f} mm of the tolerance along x, beside the mouth by less than it"
+    )
+    print(f"{'arm':32} success  with those")
+    for arm in dict.fromkeys(r.arm for r in results):
+        own = [r for r in results if r.arm == arm]
+        rates = [np.mean([r.is_success for r in own])]
+        rates.append(np.mean([r.is_success or is_short(r) for r in own]))
+        print(f"{arm:32} {rates[0]:7.0%}  {rates[1]:10.0%}")
+
+
+def motion(library: MotionLibrary) -> None:
+    """Print how far recorded mouths move within a horizon."""
+    print("frames  median  90th percentile of how far the mouth moves, mm")
+    for frames in (1, 2, 3, 4, 5, 8):
+        moves = []
+        for start, length in zip(library.run_start, library.run_length, strict=True):
+            mouth = library.mouth[start : start + length]
+            moves.append(1000.0 * np.linalg.norm(mouth[frames:] - mouth[:-frames], axis=1))
+        median, far = np.percentile(np.concatenate(moves), [50, 90])
+        print(f"{frames:6}  {median:6.1f}  {far:6.1f}")
+
+
+def main() -> None:
+    """Print all of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("results", type=Path, help="a results.jsonl of bin/Benchmark.py")
+    parser.add_argument("--motion_library", type=Path, help="the shipped one if not given")
+    options = parser.parse_args()
+    failures([line.result for line in read_lines([options.results])])
+    motion(MotionLibrary.load(options.motion_library))
+
+
+if __name__ == "__main__":
+    main()
