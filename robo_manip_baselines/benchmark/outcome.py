@@ -85,6 +85,8 @@ def write_outcome(
         "Demonstrations": f"{preset.demonstrations} of each expert, "
         + (f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"),
     }
+    if preset.caution:
+        facts["Caution"] = preset.caution
     data = report_data(study, title=f"Benchmark {plan.env}", videos=clips, facts=facts)
     _keep_only(out / TABLES, write_tables(out / TABLES, data.tables))
     _keep_only(out / PLOTS, write_plots(out / PLOTS, data.plots))

@@ -28,6 +28,7 @@ class Preset:
         threads: CPU threads of each unit, whatever the number of workers: results would differ by
             rounding with another number.
         gpu_share: of a GPU for each training and evaluation.
+        caution: for the reader of the report, empty where none is needed.
         has_videos: whether the report shows a success and a failure of each arm.
         seconds: of a unit of each kind, as measured, so that the time left can be told before
             anything has been done: per demonstration, training, evaluation episode and video.
@@ -49,6 +50,7 @@ class Preset:
     device: str = "cpu"
     threads: int = 1
     gpu_share: float = 0.0
+    caution: str = ""
     has_videos: bool = True
     seconds: Mapping[str, float] = field(default_factory=dict)
 
@@ -93,6 +95,8 @@ PRESETS: dict[str, Preset] = {
         episode_block=4,
         arms=("current", "current_pred_h2", "current_pred_h2_uniform"),
         train_args=("--steps", "200", "--hidden_size", "64", "--feedforward_size", "128"),
+        caution="This size only shows that everything works: its policies have hardly learnt "
+        "anything. --preset cpu compares arms.",
         seconds={"demonstration": 3.0, "training": 20.0, "episode": 3.0, "video": 20.0},
     ),
 }

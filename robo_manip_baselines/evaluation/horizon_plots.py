@@ -124,8 +124,13 @@ def _draw_predictions(axes: Any, study: Study) -> list[int]:
             continue
         x = [f.arm.horizon or 0 for f in arms]
         rate, low, high = np.array([_rates(f) for f in arms]).T
-        axes.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
-        axes.plot(x, rate, "o-", color=colour, label=f"prediction {label}")
+        if len(x) > 1:
+            axes.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
+            axes.plot(x, rate, "o-", color=colour, label=f"prediction {label}")
+        else:  # a band of one horizon has no width
+            ends, place = [rate - low, high - rate], x[0] + shift / 2
+            style = {"fmt": "o", "color": colour, "capsize": 4}
+            axes.errorbar(place, rate, ends, label=f"prediction {label}", **style)
         named = [(h + shift, f.arm.name) for h, f in zip(x, arms, strict=True)]
         there = [(h, 100.0 * PAPER[name].rate) for h, name in named if name in PAPER]
         if there:

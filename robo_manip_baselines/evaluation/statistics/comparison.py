@@ -111,15 +111,21 @@ def paired_success(
     if difference.n == 0:
         return PairedSuccess(difference, wins, losses, None)
     from statsmodels.stats.contingency_tables import mcnemar  # slow to import
-    from statsmodels.stats.proportion import proportion_confint
 
     if wins == losses == 0:
-        ends: Any = proportion_confint(0, difference.n, alpha=SIGNIFICANCE, method="beta")
-        difference = replace(difference, low=-float(ends[1]), high=float(ends[1]))
+        difference = not_seen(difference)
     both = int(((ours == 1.0) & (theirs == 1.0)).sum())
     neither = difference.n - both - wins - losses
     test: Any = mcnemar([[both, wins], [losses, neither]], exact=True)
     return PairedSuccess(difference, wins, losses, float(test.pvalue))
+
+
+def not_seen(difference: Estimate) -> Estimate:
+    """Return a difference of rates that no episode showed with Clopper and Pearson's bounds."""
+    from statsmodels.stats.proportion import proportion_confint  # slow to import
+
+    ends: Any = proportion_confint(0, difference.n, alpha=SIGNIFICANCE, method="beta")
+    return replace(difference, low=-float(ends[1]), high=float(ends[1]))
 
 
 def paired_times(

@@ -10,6 +10,7 @@ import numpy as np
 
 from robo_manip_baselines.evaluation.paper_results import PAPER
 from robo_manip_baselines.evaluation.statistics.arms import PAPER_ERROR, PAPER_HORIZONS
+from robo_manip_baselines.evaluation.statistics.comparison import not_seen
 from robo_manip_baselines.evaluation.statistics.intervals import Estimate, mean_estimate
 from robo_manip_baselines.evaluation.statistics.outcomes import on_common_seeds
 from robo_manip_baselines.evaluation.statistics.study import Study
@@ -135,5 +136,8 @@ def findings(study: Study) -> tuple[Finding, ...]:
             rng = np.random.default_rng([study.seed, zlib.crc32(claim.text.encode())])
             grids = on_common_seeds([outcomes[name] for name in claim.weights], claim.measure)
             contrast = np.tensordot(list(claim.weights.values()), grids, axes=1)
-            found.append(Finding(claim, mean_estimate(contrast, rng, study.resamples)))
+            estimate = mean_estimate(contrast, rng, study.resamples)
+            if claim.measure == "success" and estimate.n and not np.nan_to_num(contrast).any():
+                estimate = not_seen(estimate)
+            found.append(Finding(claim, estimate))
     return tuple(found)

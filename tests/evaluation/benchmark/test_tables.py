@@ -14,6 +14,7 @@ import pytest
 from robo_manip_baselines.evaluation.cells import later, p_cell, percent, points, seconds
 from robo_manip_baselines.evaluation.failure import FAILURES
 from robo_manip_baselines.evaluation.paper_results import PAPER
+from robo_manip_baselines.evaluation.statistics.findings import findings
 from robo_manip_baselines.evaluation.statistics.lines import Line, Selection
 from robo_manip_baselines.evaluation.statistics.study import Study, analyse
 from robo_manip_baselines.evaluation.study_tables import study_tables
@@ -168,6 +169,25 @@ def test_one_training_seed_has_no_columns_for_several(
     assert "by_training_seed" not in to_csv(tables[1])
     assert "bootstrap" not in to_markdown(tables[0])
     assert to_markdown(tables[0]).count("**") == 4  # the title, and the best of one
+
+
+@pytest.mark.long
+def test_no_difference_seen_is_not_no_difference(
+    make_lines: Callable[..., tuple[Line, ...]],
+) -> None:
+    """Two arms that end alike in four episodes: the claim's interval is the paired one's."""
+    lines = make_lines(arms=["baseline", "current"], train_seeds=1, episodes=4)
+    alike = [
+        replace(line, result=replace(line.result, is_success=False, completion_time=None))
+        for line in lines
+    ]
+    study = analyse(alike, resamples=50)
+    (claim,) = findings(study)
+    pairs = study.arms[0].paired_success
+    assert pairs is not None
+    assert claim.verdict == "undecided"
+    assert claim.contrast.high == pairs.difference.high == pytest.approx(1 - 0.025 ** (1 / 4))
+    assert claim.contrast.low == pairs.difference.low
 
 
 @pytest.mark.long
