@@ -50,7 +50,7 @@ setup: ## .venv with the pinned packages (every target does this by itself)
 	@.ci/setup $(PYTHON)
 
 opengl: setup
-	@$(BIN)/python robo_manip_baselines/opengl_check.py --install
+	@$(BIN)/python robo_manip_baselines/envs/mujoco/cell/opengl.py --install
 
 # PYTHON=3.12 is the Python of the machine that the wheels are for; .venv is left as it is.
 wheelhouse: ## all wheels for a machine without network: make wheelhouse PYTHON=3.12 [WITH_TORCH=1]

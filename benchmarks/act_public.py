@@ -14,10 +14,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from robo_manip_baselines.policy.act.backbone import FrozenBatchNorm, ResNet18
 from robo_manip_baselines.policy.act.config import ActConfig
-from robo_manip_baselines.policy.act.cvae import kl_divergence
-from robo_manip_baselines.policy.act.model import ActModel
+from robo_manip_baselines.policy.act.model import ActModel, kl_divergence
+from robo_manip_baselines.policy.act.resnet import FrozenBatchNorm, ResNet18
 from robo_manip_baselines.policy.interface import Batch, Sizes
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any, cast
 
-from robo_manip_baselines.command import parse, run_command
+from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 prepare_pytorch()  # before PyTorch is imported: how its threads wait
@@ -24,10 +24,10 @@ import torch  # noqa: E402
 from act_public import PublicWay  # noqa: E402
 from torch import Tensor  # noqa: E402
 
-from robo_manip_baselines.errors import RequestError, require_choice  # noqa: E402
 from robo_manip_baselines.policy.act.config import ActConfig  # noqa: E402
 from robo_manip_baselines.policy.act.model import ActModel  # noqa: E402
 from robo_manip_baselines.policy.interface import Batch, PolicyModel, Sizes  # noqa: E402
+from robo_manip_baselines.runs.errors import RequestError, require_choice  # noqa: E402
 
 PHASES = ("transfer", "forward", "backward", "optimiser")
 WARM_UP = 2

@@ -16,18 +16,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from robo_manip_baselines.command import parse, run_command
 from robo_manip_baselines.data import EpisodeReader, decode_image, list_episodes
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.expert.collect import Collection, collect
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
-from robo_manip_baselines.observation.options import parse_image_size
+from robo_manip_baselines.observation.spec import parse_image_size
+from robo_manip_baselines.rollout.demonstrate import Collection, collect
+from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.training.batching import BatchLoader
 from robo_manip_baselines.training.device import choose_device
-from robo_manip_baselines.training.frames import FrameSource, fit_image, processors
-from robo_manip_baselines.training.loader import BatchLoader
-from robo_manip_baselines.training.schedule import Schedule
+from robo_manip_baselines.training.images import FrameSource, fit_image, processors
+from robo_manip_baselines.training.sampling import Schedule
 
 EXAMPLE = "python benchmarks/batch_loading.py --batch_size 8 --image_size 240x320"
 

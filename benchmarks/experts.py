@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import mink
 import numpy as np
 
-from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.envs.mujoco.feeding_env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.feeding_success import Phase
-from robo_manip_baselines.envs.mujoco.registration import make_env
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.expert.feeding import EXPERTS, FeedingExpert
+from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS, FeedingExpert
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
+from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)

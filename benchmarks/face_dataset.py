@@ -29,8 +29,8 @@ from face_prediction.dataset.manifest import CLIP_FOLDER
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import clip_frames, find_sequences
 from face_prediction.dataset.settings import CropFrom
-from face_prediction.lifting import LIPS
-from face_prediction.tracks import load_track
+from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.tracks import load_track
 
 
 def sizes(dataset: FaceDataset) -> tuple[Counter[str], int, int]:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.feeding_success import MOUTH_TOLERANCE
-from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.evaluation.result import EpisodeResult
-from robo_manip_baselines.evaluation.statistics.lines import read_lines
+from robo_manip_baselines.benchmark.statistics.outcomes import read_lines
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
+from robo_manip_baselines.rollout.results import EpisodeResult
 
 BLIND = "baseline"
 """Arm that knows nothing of the mouth where there are no images."""

@@ -19,25 +19,24 @@ from pathlib import Path
 
 import numpy as np
 
-from face_prediction.attribution import read_attributions
-from face_prediction.dataset.kinds import KINDS, kind_of
 from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.settings import SequenceSettings
+from face_prediction.dataset.settings import KINDS, SequenceSettings, kind_of
 from face_prediction.evaluation import (
     Interval,
     cluster_bootstrap,
     data_hash,
     measure_error_stats,
     mouth_distances,
-    mouth_errors,
     mouth_residuals,
     normalised_mean_errors,
     save_error_stats,
     skill,
 )
+from face_prediction.evaluation.errors import mouth_errors
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
-from face_prediction.forecast.folds import subject_folds
-from face_prediction.tracks import load_track
+from face_prediction.forecast.interface import subject_folds
+from face_prediction.motion.library import read_attributions
+from face_prediction.tracking.tracks import load_track
 
 PERSISTENCE = "persistence"
 FOLDS = 5

@@ -13,9 +13,9 @@ import argparse
 import numpy as np
 from tqdm import tqdm
 
-from robo_manip_baselines.evaluation.statistics.comparison import paired_success
-from robo_manip_baselines.evaluation.statistics.intervals import rate_estimate
-from robo_manip_baselines.evaluation.summary import share
+from robo_manip_baselines.benchmark.statistics.comparison import paired_success
+from robo_manip_baselines.benchmark.statistics.intervals import rate_estimate
+from robo_manip_baselines.rollout.results import share
 
 DIFFICULTY = 1.2
 """Standard deviation of the episodes' log-odds: from 1 in 7 to 6 in 7 at one of them."""

@@ -21,16 +21,19 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.evaluation.baseline_predictor import BaselinePredictor
-from face_prediction.forecast.persistence import Persistence
-from face_prediction.history_pictures import dataset_picture
-from face_prediction.live.network import NetworkForecasting
-from face_prediction.live.streaming import Forecasting, LandmarkForecasting, StreamingPredictor
+from face_prediction.evaluation.setup import BaselinePredictor
+from face_prediction.forecast.simple import Persistence
+from face_prediction.live.streaming import (
+    Forecasting,
+    LandmarkForecasting,
+    NetworkForecasting,
+    StreamingPredictor,
+)
 from face_prediction.models.interface import History, PredictorModel
-from face_prediction.models.presets import PRESETS, preset_settings
-from face_prediction.models.registry import MODELS, make_model
-from face_prediction.tracks import NUM_LANDMARKS
+from face_prediction.models.settings import MODELS, PRESETS, make_model, preset_settings
+from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 IMAGE = (640, 480)
 SETTINGS = SequenceSettings()

@@ -26,12 +26,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.envs.mujoco.feeding_env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.rendering import CameraRenderer
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.envs.mujoco.cell.opengl import backend_in_use
+from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
+from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.observation import CAMERAS
-from robo_manip_baselines.opengl_check import backend_in_use
+from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 EXAMPLE = "python benchmarks/render_cameras.py --gym_aloha /tmp/gym-aloha --rounds 50"
 SCENE = Path("gym_aloha", "assets", "bimanual_viperx_transfer_cube.xml")

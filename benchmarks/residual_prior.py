@@ -25,8 +25,7 @@ from face_prediction.forecast import (
     fit_forecaster,
     mouth_centre,
 )
-from face_prediction.models.residual.experts import EXPERTS, Expert
-from face_prediction.models.residual.prior import AdaptivePrior
+from face_prediction.models.residual.prior import EXPERTS, AdaptivePrior, Expert
 
 HISTORY, HORIZON = 70, 5
 SHAPES = 8

@@ -18,15 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.env_workers import open_environments
-from robo_manip_baselines.evaluation.rollout import Policy, rollout
-from robo_manip_baselines.evaluation.slots import Order
-from robo_manip_baselines.evaluation.task import Task
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.options import parse_image_size
-from robo_manip_baselines.opengl_check import opengl_problem
+from robo_manip_baselines.observation.spec import parse_image_size
+from robo_manip_baselines.rollout.rollout import Policy, rollout
+from robo_manip_baselines.rollout.workers import Order, Task, open_environments
+from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ def policy_for(options: Options, num_envs: int) -> Policy:
     if options.checkpoint is None:
         return Still()
     from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
-    from robo_manip_baselines.policy.chunk_policy import ChunkPolicy
+    from robo_manip_baselines.policy.execution import ChunkPolicy
     from robo_manip_baselines.training.device import choose_device
 
     checkpoint, device = read_checkpoint(options.checkpoint), choose_device("auto")

@@ -14,15 +14,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.envs.mujoco.scene import add_cube, build_cell
-from robo_manip_baselines.envs.mujoco.vx300s import (
+from robo_manip_baselines.envs.mujoco.cell.scene import add_cube, build_cell
+from robo_manip_baselines.envs.mujoco.cell.vx300s import (
     ARM_JOINTS,
     FINGER_CLOSED,
     FINGER_OPEN,
     HOME_QPOS,
 )
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 EXAMPLE = "python benchmarks/step_response.py --plot step_response.png"
 ARM = "right"

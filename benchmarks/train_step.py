@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from robo_manip_baselines.command import run_command
+from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 prepare_pytorch()  # before PyTorch is imported: how its threads wait
@@ -34,14 +34,14 @@ from robo_manip_baselines.data import encode_image, episode_path, write_episode 
 from robo_manip_baselines.data.example import make_arrays, make_attributes  # noqa: E402
 from robo_manip_baselines.policy.interface import Batch  # noqa: E402
 from robo_manip_baselines.training.device import (  # noqa: E402
+    Processes,
     choose_device,
     describe_device,
     prepare_device,
 )
-from robo_manip_baselines.training.distributed import Processes  # noqa: E402
-from robo_manip_baselines.training.job import Job  # noqa: E402
 from robo_manip_baselines.training.options import parse_options  # noqa: E402
-from robo_manip_baselines.training.parts import Parts, assembled  # noqa: E402
+from robo_manip_baselines.training.setup import Job  # noqa: E402
+from robo_manip_baselines.training.trainer import Parts, assembled  # noqa: E402
 
 EPISODES = 10
 EPISODE_STEPS = 120

@@ -1,6 +1,6 @@
 """Train and evaluate every arm of a benchmark on common seeds, then write tables and a report."""
 
-from robo_manip_baselines.command import parse, run_command
+from robo_manip_baselines.runs.command import parse, run_command
 
 
 def main() -> int:
@@ -9,8 +9,7 @@ def main() -> int:
     from robo_manip_baselines.training.requirements import prepare_pytorch
 
     prepare_pytorch()
-    from robo_manip_baselines.benchmark.command import benchmark
-    from robo_manip_baselines.benchmark.options import EXAMPLE, BenchmarkOptions
+    from robo_manip_baselines.commands.benchmark import EXAMPLE, BenchmarkOptions, benchmark
 
     return benchmark(parse(BenchmarkOptions, EXAMPLE))
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.data.dataset_command import Command
+from robo_manip_baselines.commands.dataset import Command
+from robo_manip_baselines.runs.command import parse, run_command
 
 
 def main() -> int:

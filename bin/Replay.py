@@ -1,12 +1,12 @@
 """Act recorded episodes out again and compare them with what was recorded."""
 
-from robo_manip_baselines.command import parse, run_command
+from robo_manip_baselines.runs.command import parse, run_command
 
 
 def main() -> int:
     """Read the command line and replay."""
     # Imported here, so that run_command can say what is wrong if MuJoCo's backend is missing.
-    from robo_manip_baselines.evaluation.replay_command import (
+    from robo_manip_baselines.commands.replay import (
         EXAMPLE,
         ReplayOptions,
         replay_command,

@@ -2,7 +2,7 @@
 
 import sys
 
-from robo_manip_baselines.command import run_command
+from robo_manip_baselines.runs.command import run_command
 
 
 def main() -> int:
@@ -11,7 +11,7 @@ def main() -> int:
     from robo_manip_baselines.training.requirements import prepare_pytorch
 
     prepare_pytorch()
-    from robo_manip_baselines.training.train_command import train
+    from robo_manip_baselines.commands.train import train
 
     return train(sys.argv[1:])
 

@@ -7,6 +7,6 @@ needs neither MediaPipe, nor OpenGL, nor a display, nor a GPU.
 from __future__ import annotations
 
 from face_prediction.errors import RequestError
-from face_prediction.tracks import FaceTrack, load_track, save_track
+from face_prediction.tracking.tracks import FaceTrack, load_track, save_track
 
 __all__ = ["FaceTrack", "RequestError", "load_track", "save_track"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from face_prediction.cli import main
+from face_prediction.commands.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

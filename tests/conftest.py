@@ -17,7 +17,7 @@ if sys.platform == "linux":
 # other, and small networks in tests get a hundred times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from robo_manip_baselines.opengl_check import opengl_problem
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 
-from robo_manip_baselines.command import run_command
-from robo_manip_baselines.evaluation.preview import preview_frames
+from robo_manip_baselines.rollout.videos import preview_frames
+from robo_manip_baselines.runs.command import run_command
 
 EPISODE = Path("dataset/FeedingEnv_demo/episode_000000.hdf5")
 FRAME = 150  # 6 s, on the way to the mouth

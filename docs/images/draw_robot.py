@@ -8,11 +8,11 @@ import cv2
 import mujoco
 import numpy as np
 
-from robo_manip_baselines.command import run_command
-from robo_manip_baselines.envs.mujoco.rendering import CameraRenderer
-from robo_manip_baselines.envs.mujoco.scene import add_cube, build_cell, look_at
-from robo_manip_baselines.envs.mujoco.vx300s import ARM_JOINTS, FINGER_CLOSED, HOME_QPOS
+from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
+from robo_manip_baselines.envs.mujoco.cell.scene import add_cube, build_cell, look_at
+from robo_manip_baselines.envs.mujoco.cell.vx300s import ARM_JOINTS, FINGER_CLOSED, HOME_QPOS
 from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.runs.command import run_command
 
 FOLDER = Path(__file__).parent
 HOLDING = FINGER_CLOSED + 0.02

@@ -16,13 +16,26 @@ from typing import Any
 import h5py
 import numpy as np
 
-from face_prediction.dataset.clip_file import damage, open_clip, read_array, read_record
-from face_prediction.dataset.crop import Crop
-from face_prediction.dataset.facts import FACTS
-from face_prediction.dataset.manifest import CLIP_FOLDER, ClipEntry, SequenceRow, read_manifest
-from face_prediction.dataset.pictures import REDUCTIONS, checksum, decode_picture
-from face_prediction.dataset.split import FoldSplit, fold_split
+from face_prediction.dataset.clip_file import (
+    REDUCTIONS,
+    checksum,
+    damage,
+    decode_picture,
+    open_clip,
+    read_array,
+    read_record,
+)
+from face_prediction.dataset.manifest import (
+    CLIP_FOLDER,
+    FACTS,
+    ClipEntry,
+    FoldSplit,
+    SequenceRow,
+    fold_split,
+    read_manifest,
+)
 from face_prediction.errors import RequestError
+from face_prediction.tracking.crop import Crop
 
 #: Clip files kept open at once; a process may open some thousand.
 MAX_OPEN = 64

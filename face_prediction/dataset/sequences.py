@@ -10,16 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from face_prediction.dataset.crop import Crop, crop_around
 from face_prediction.dataset.settings import SequenceSettings
 from face_prediction.errors import RequestError
-from face_prediction.lifting import jaw_openings, mouth_centres
-from face_prediction.motion import has_constant_rate
-from face_prediction.quality import Quality, assess
-from face_prediction.resample import SAME_TIME, Samples, resample
-from face_prediction.rigid_pose import rigid_head_poses
-from face_prediction.rotations import quaternion_from_matrix
-from face_prediction.tracks import FaceTrack
+from face_prediction.motion.motion import Quality, assess, has_constant_rate
+from face_prediction.tracking.crop import Crop, crop_around
+from face_prediction.tracking.extract import SAME_TIME, Samples, resample
+from face_prediction.tracking.geometry import quaternion_from_matrix, rigid_head_poses
+from face_prediction.tracking.lifting import jaw_openings, mouth_centres
+from face_prediction.tracking.tracks import FaceTrack
 
 #: Why a sequence is dropped; the first that holds is counted.
 REASONS: tuple[str, ...] = ("no_face", "jump", "spike")

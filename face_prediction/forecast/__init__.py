@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from face_prediction.forecast.interface import Forecaster, LandmarkSequences
-from face_prediction.forecast.mouth import mouth_centre
+from face_prediction.forecast.interface import Forecaster, LandmarkSequences, mouth_centre
 from face_prediction.forecast.registry import FORECASTERS, fit_forecaster, restore_forecaster
 
 __all__ = [

@@ -1,14 +1,14 @@
-"""Autoregression on displacements: of the mouth centre, and of all landmarks.
+"""Vector autoregression by least squares: fitting, stability, forecasting, choice of order.
 
-Both forecast how far things move from frame to frame, from how far they moved before
-(`least_squares`), and add that to the last frame. Order (and components) are those that forecast
-subjects held out best, at horizons of 1 to 5 frames together.
+x[t] = sum over k = 1..P of x[t - k] @ A[k - 1] + noise, without a constant: x are displacements
+from frame to frame, and a drift learnt from other people is none of this one's.
 
-Legend: N sequences, B batch, T frames, H horizon, L landmarks, P order, D components.
+Legend: N sequences, T frames, P order, D components, H horizon, B batch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
@@ -17,19 +17,184 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.errors import RequestError
-from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences
-from face_prediction.forecast.least_squares import (
-    choose,
-    forecast,
-    moments,
-    require_order,
-    solve,
+from face_prediction.forecast.interface import (
+    Array,
+    Forecaster,
+    LandmarkSequences,
+    mouth_centre,
+    subject_folds,
 )
-from face_prediction.forecast.mouth import mouth_centre
-from face_prediction.tracks import NUM_LANDMARKS
+from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+Floats = NDArray[np.float64]
+
+#: Share of the regressors' mean square that is added to the diagonal: keeps still faces solvable
+#: and changes coefficients by parts in a million.
+RIDGE = 1e-6
+#: Largest modulus of an eigenvalue; a displacement then halves within 70 frames at the latest.
+MAX_RADIUS = 0.99
+#: Parts that the subjects are dealt into to choose an order
+FOLDS = 5
+#: Frames between the ends of the histories that a choice is judged at, and how many a sequence
+_ORIGIN_STEP = 10
+_ORIGINS = 4
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Sums over rows of regressors and targets: ``cross`` (P, D, P, D) and ``aim`` (P, D, D)."""
+
+    cross: Floats
+    aim: Floats
+
+    def __sub__(self, other: Moments) -> Moments:
+        return Moments(self.cross - other.cross, self.aim - other.aim)
+
+    def __add__(self, other: Moments) -> Moments:
+        return Moments(self.cross + other.cross, self.aim + other.aim)
+
+
+def moments(series: Floats, order: int) -> Moments:
+    """Moments of ``series`` (N, T, D); lag k stands at index k - 1."""
+    size = series.shape[1]
+    lagged = np.stack(
+        [series[:, order - k : size - k] for k in range(1, order + 1)], axis=2
+    )  # (N, T - P, P, D)
+    components = series.shape[2]
+    rows = lagged.reshape(-1, order * components)
+    target = series[:, order:].reshape(-1, components)
+    shape = (order, components)
+    return Moments(
+        (rows.T @ rows).reshape(*shape, *shape), (rows.T @ target).reshape(*shape, components)
+    )
+
+
+def solve(sums: Moments, order: int, components: int) -> Floats:
+    """Coefficients (P, D, D) of the first ``order`` lags and ``components`` components; stable."""
+    size = order * components
+    cross = sums.cross[:order, :components, :order, :components].reshape(size, size)
+    aim = sums.aim[:order, :components, :components].reshape(size, components)
+    ridge = RIDGE * max(np.trace(cross) / size, np.finfo(float).tiny)
+    solved = np.linalg.solve(cross + ridge * np.eye(size), aim)
+    return stabilised(solved.reshape(order, components, components))
+
+
+def spectral_radius(coefficients: Floats) -> float:
+    """Largest modulus of the eigenvalues of the companion matrix of (P, D, D)."""
+    order, components = coefficients.shape[:2]
+    companion = np.zeros((order * components,) * 2)
+    companion[:, :components] = coefficients.reshape(-1, components)
+    companion[:-components, components:] = np.eye((order - 1) * components)
+    return float(np.abs(np.linalg.eigvals(companion)).max())
+
+
+def stabilised(coefficients: Floats, limit: float = MAX_RADIUS) -> Floats:
+    """The same, or with A[k] times (limit / radius)^k, which moves every eigenvalue inside."""
+    radius = spectral_radius(coefficients)
+    if radius <= limit:
+        return coefficients
+    lags = np.arange(1, len(coefficients) + 1)
+    return coefficients * ((limit / radius) ** lags)[:, None, None]
+
+
+def forecast(coefficients: Floats, recent: Floats, horizon: int) -> Floats:
+    """Expected next values (B, H, D) after ``recent`` (B, any, D), the newest last.
+
+    Before what is given the series is taken to have been 0.
+    """
+    order = len(coefficients)
+    newest_first = [recent[:, -k] for k in range(1, min(order, recent.shape[1]) + 1)]
+    result = []
+    for _ in range(horizon):
+        terms = (x @ a for x, a in zip(newest_first, coefficients, strict=False))
+        following = sum(terms, np.zeros((recent.shape[0], recent.shape[2])))
+        result.append(following)
+        newest_first.insert(0, following)
+    return np.stack(result, axis=1)
+
+
+def choose(
+    series: Floats,
+    mouth: Floats,
+    readout: Floats,
+    subjects: tuple[str, ...],
+    candidates: Iterable[tuple[int, int]],
+    horizon: int,
+) -> tuple[int, int]:
+    """The (order, components) with the least of `held_out_errors`; the smaller of equal ones."""
+    errors = held_out_errors(series, mouth, readout, subjects, candidates, horizon)
+    return min(sorted(errors), key=errors.__getitem__)
+
+
+def held_out_errors(
+    series: Floats,
+    mouth: Floats,
+    readout: Floats,
+    subjects: tuple[str, ...],
+    candidates: Iterable[tuple[int, int]],
+    horizon: int,
+) -> dict[tuple[int, int], float]:
+    """Error of each (order, components) on subjects that were not fitted to.
+
+    Args:
+        series: (N, T, D) displacements, the components most worth keeping first.
+        mouth: (N, T, 2) displacements of the mouth centre.
+        readout: (D, 2) mouth displacement that each component stands for.
+        subjects: N names.
+        candidates: pairs to try.
+        horizon: the error is the mean of abs dU and dV of the mouth centre over frames 1 to this.
+
+    Raises:
+        RequestError: all sequences are of one subject, or too short for the candidates.
+    """
+    wanted = list(candidates)
+    longest = max(order for order, _ in wanted)
+    if len(set(subjects)) < 2:
+        raise RequestError(
+            "sequences of 1 subject; an order is chosen on people held out: give 2 or more "
+            "subjects, or the order"
+        )
+    origins = _origins(series.shape[1], longest, horizon)
+    fold = subject_folds(subjects, FOLDS)
+    parts = [moments(series[fold == f], longest) for f in range(fold.max() + 1)]
+    whole = sum(parts[1:], parts[0])
+    totals = dict.fromkeys(wanted, 0.0)
+    for f, part in enumerate(parts):
+        rest = whole - part
+        for order, components in wanted:
+            coefficients = solve(rest, order, components)
+            for origin in origins:
+                recent = series[fold == f, :origin, :components]
+                ahead = forecast(coefficients, recent, horizon) @ readout[:components]
+                true = mouth[fold == f, origin : origin + horizon]
+                error = np.abs(np.cumsum(ahead - true, axis=1)).sum()
+                totals[order, components] += float(error)
+    count = len(series) * len(origins) * horizon * 2
+    return {pair: total / count for pair, total in totals.items()}
+
+
+def require_order(order: int, steps: int) -> None:
+    """Raise RequestError unless ``steps`` displacements a sequence leave rows to fit ``order``."""
+    if not 1 <= order < steps:
+        raise RequestError(
+            f"order {order}: must be 1 to {steps - 1} for sequences of {steps + 1} frames"
+        )
+
+
+def _origins(steps: int, order: int, horizon: int) -> list[int]:
+    """Ends of histories, the last first, each with ``horizon`` steps after it."""
+    last = steps - horizon
+    if last < order:
+        raise RequestError(
+            f"sequences of {steps + 1} frames; order {order} and horizon {horizon} need "
+            f"{order + horizon + 1} or more"
+        )
+    return list(range(last, order - 1, -_ORIGIN_STEP))[:_ORIGINS]
+
 
 #: The paper's horizon: frames 71 to 75
 HORIZON = 5

@@ -1,13 +1,13 @@
-"""What every forecaster offers: ``fit(sequences)`` once, then ``predict(history, horizon)``.
+"""The mouth centre in image coordinates.
 
-Coordinates are normalised to the square crop of a sequence: x right and y down, 0 to 1.
-Legend: N sequences, T frames of history (or of a sequence), H horizon, L landmarks.
+Legend: L = 468 landmarks.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -15,10 +15,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.errors import RequestError
-from face_prediction.tracks import NUM_LANDMARKS
+from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+_LIPS = list(LIPS)
+
+
+def mouth_centre(landmarks: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Mean (..., 2) of the 40 lip landmarks of (..., L, 2 or 3), in the landmarks' own unit.
+
+    The paper's mouth centre: "the average of the U and V coordinates of all mouth-related
+    landmarks" (section IV.B).
+    """
+    return np.asarray(landmarks)[..., _LIPS, :2].mean(axis=-2, dtype=np.float64)
+
+
+def subject_folds(subjects: Sequence[str], folds: int) -> NDArray[np.int64]:
+    """Fold (N,) of each sequence: all of one subject in one fold, the folds about equally large.
+
+    The subject with most sequences goes first, each into the smallest fold; equal ones by name,
+    so that the same subjects give the same folds. There are never more folds than subjects.
+    """
+    amounts = sorted(Counter(subjects).items(), key=lambda item: (-item[1], item[0]))
+    sizes = [0] * min(folds, len(amounts))
+    fold_of: dict[str, int] = {}
+    for subject, amount in amounts:
+        fold_of[subject] = sizes.index(min(sizes))
+        sizes[fold_of[subject]] += amount
+    return np.array([fold_of[subject] for subject in subjects], dtype=np.int64)
+
 
 Array = NDArray[np.floating]
 

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from face_prediction.errors import RequestError
-from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences
-from face_prediction.forecast.mouth import mouth_centre
+from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences, mouth_centre
 
 if TYPE_CHECKING:
     from typing_extensions import Self

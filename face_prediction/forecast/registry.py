@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from face_prediction.errors import RequestError
 from face_prediction.forecast.autoregression import LandmarkAutoregression, MouthAutoregression
-from face_prediction.forecast.constant_velocity import ConstantVelocity, Line
 from face_prediction.forecast.interface import Forecaster, LandmarkSequences
 from face_prediction.forecast.kalman import KalmanConstantVelocity
-from face_prediction.forecast.persistence import Persistence
+from face_prediction.forecast.simple import ConstantVelocity, Line, Persistence
 
 FORECASTERS: dict[str, type[Forecaster]] = {
     kind.name: kind

@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.live.overlay import GREEN, NEAR, WHITE, Colour, draw_lines, draw_mouth
-from face_prediction.live.sinks import Sink
+from face_prediction.live.sinks import GREEN, NEAR, WHITE, Colour, Sink, draw_lines, draw_mouth
 from face_prediction.live.streaming import LiveForecast, StreamingPredictor
-from face_prediction.video import VideoFrame
+from face_prediction.tracking.video import VideoFrame
 
 #: Frames that the rates on the screen are averaged over.
 RECENT = 30

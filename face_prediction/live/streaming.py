@@ -1,25 +1,73 @@
-"""A predictor that is shown one frame after another and remembers what it needs.
+"""The landmarks seen so far at the predictor's rate, whatever the camera's is.
 
-Legend: T frames of history, H horizon, L = 468 landmarks, S side of the pictures, P pictures at
-the end of the history, K neighbouring pictures that one frame's features come from.
+Everything is counted back from the newest frame, so that nothing waits for a later one: the
+history is what was seen 0, 1, 2, ... thirtieths of a second before it, between two frames on the
+straight line, and before the first frame at rest.
+
+Legend: N frames seen, T frames of history, L = 468 landmarks.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.crop import Crop, crop_around
+from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.history_pictures import dataset_picture
-from face_prediction.live.history import landmarks_at, nearest, times_back
-from face_prediction.predicted_motion import image_points
-from face_prediction.predictor import PictureNeeds, Predictor
-from face_prediction.resample import MAX_GAP, SAME_TIME
+from face_prediction.errors import RequestError
+from face_prediction.prediction.interface import PictureNeeds, Predictor
+from face_prediction.prediction.predicted_motion import image_points
+from face_prediction.tracking.crop import Crop, crop_around
+from face_prediction.tracking.extract import MAX_GAP, SAME_TIME
+from face_prediction.tracking.tracks import NUM_LANDMARKS
+
+if TYPE_CHECKING:
+    import torch
+
+    from face_prediction.models.interface import PredictorModel
+
+
+def times_back(now: float, count: int, fps: float) -> NDArray[np.float64]:
+    """The last ``count`` times (T,) of a history that ends at ``now``, the newest last."""
+    return now - np.arange(count - 1, -1, -1) / fps
+
+
+def landmarks_at(
+    wanted: NDArray[np.float64],
+    times: NDArray[np.float64],
+    landmarks: NDArray[np.floating],
+) -> NDArray[np.float64]:
+    """Landmarks (T, L, C) at ``wanted`` (T,), none later than the last of ``times``.
+
+    Args:
+        wanted: s; a time less than a millisecond from a frame's is that frame's.
+        times: (N,) s, increasing.
+        landmarks: (N, L, C).
+    """
+    after = np.clip(np.searchsorted(times, wanted - SAME_TIME), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    gap = times[after] - times[before]
+    weight = np.divide(wanted - times[before], gap, out=np.ones_like(wanted), where=gap > 0)
+    # a time at a frame takes nothing from its neighbour, and one before the first has none
+    weight = np.where(times[after] - wanted < SAME_TIME, 1.0, np.clip(weight, 0.0, 1.0))
+    result = landmarks[after].astype(np.float64)
+    made = weight < 1.0
+    part = weight[made, None, None]
+    result[made] = (1 - part) * landmarks[before[made]] + part * result[made]
+    return result
+
+
+def nearest(wanted: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Index (T,) of the frame nearest to each of ``wanted`` (T,); of two as near, the earlier."""
+    after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    is_later = wanted - times[before] > times[after] - wanted + SAME_TIME
+    return np.where(is_later, after, before)
+
 
 #: A crop is laid anew when its side is this many times, or one such part of, what it would be.
 SIZE_CHANGE = 1.25
@@ -240,3 +288,79 @@ class StreamingPredictor:
             size = self._forecasting.needs.size
             frame.picture = dataset_picture(frame.image, self._crop, self._settings, size)
         return frame.picture
+
+
+class NetworkForecasting:
+    """Features and forecasts of one network, in eval mode.
+
+    Args:
+        network: on its device.
+        name: what messages call it.
+
+    Raises:
+        RequestError: the network forecasts no landmarks.
+    """
+
+    def __init__(self, network: PredictorModel, name: str) -> None:
+        self._network = network.eval()
+        self._device = next(network.parameters()).device
+        needs = network.needs
+        # a first run, which takes longer than others, before a camera waits for it
+        still = np.zeros((network.history, NUM_LANDMARKS, 2), dtype=np.float32)
+        black = np.zeros((network.span, needs.size, needs.size, 3), dtype=np.uint8)
+        features = self.features(still[: network.span], black)
+        ahead = self._decode(still, [features] * (needs.frames - network.span + 1), black[-1])
+        if ahead is None:
+            raise RequestError(f"{name}: forecasts pictures and no landmarks; use another network")
+
+    @property
+    def needs(self) -> PictureNeeds:
+        """Which pictures it looks at."""
+        return self._network.needs
+
+    @property
+    def span(self) -> int:
+        """K."""
+        return self._network.span
+
+    def features(self, landmarks: NDArray[np.float32], pictures: NDArray[np.uint8]) -> Any:
+        """Features (1, 1, ...) of one frame, from landmarks (K, L, 2) and pictures (K, S, S, 3)."""
+        import torch
+
+        with torch.inference_mode():
+            return self._network.encode(self._tensor(landmarks), self._tensor(pictures))
+
+    def forecast(
+        self,
+        landmarks: NDArray[np.float32],
+        features: list[Any],
+        last_picture: NDArray[np.uint8] | None,
+    ) -> NDArray[np.float32]:
+        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features."""
+        assert last_picture is not None
+        ahead = self._decode(landmarks[-self._network.history :], features, last_picture)
+        assert ahead is not None
+        return ahead
+
+    def _decode(
+        self,
+        landmarks: NDArray[np.float32],
+        features: list[Any],
+        last_picture: NDArray[np.uint8],
+    ) -> NDArray[np.float32] | None:
+        import torch
+
+        with torch.inference_mode():
+            output = self._network.decode(
+                self._tensor(landmarks),
+                torch.cat(features, dim=1),
+                self._tensor(last_picture),
+                make_pictures=False,
+            )
+        return None if output.landmarks is None else output.landmarks[0].float().cpu().numpy()
+
+    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
+        """A batch of one, on the network's device."""
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(values))[None].to(self._device)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from face_prediction.forecast.interface import LandmarkSequences
-from face_prediction.predictor import PictureNeeds
+from face_prediction.prediction.interface import PictureNeeds
 
 
 @dataclass(frozen=True)

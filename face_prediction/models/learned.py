@@ -16,12 +16,12 @@ from torch import Tensor
 from face_prediction.errors import RequestError
 from face_prediction.models.checkpoint import CheckpointRecord, load_model
 from face_prediction.models.interface import History, Output, PredictorModel
-from face_prediction.predictor import Forecast, PictureNeeds
-from face_prediction.tracks import NUM_LANDMARKS
+from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 
 class LearnedPredictor:
-    """Runs a network on batches of histories; see `face_prediction.predictor.Predictor`.
+    """Runs a network on batches of histories; see `face_prediction.prediction.interface.Predictor`.
 
     Args:
         model: on its device; put into eval mode.

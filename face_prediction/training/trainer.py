@@ -15,13 +15,11 @@ from tqdm import tqdm
 
 from face_prediction.errors import RequestError
 from face_prediction.models.checkpoint import CheckpointRecord, save_checkpoint
+from face_prediction.models.settings import TrainSettings
 from face_prediction.training.metrics import MetricsLog, RunningMean
-from face_prediction.training.sampler import Sampler
-from face_prediction.training.settings import TrainSettings
-from face_prediction.training.state import Progress, save_state
-from face_prediction.training.step import TrainStep
+from face_prediction.training.step import Progress, TrainStep, save_state
 from face_prediction.training.validation import Validation, selection_error
-from face_prediction.training.windows import Windows, batches
+from face_prediction.training.windows import Sampler, Windows, batches
 
 logger = logging.getLogger(__name__)
 

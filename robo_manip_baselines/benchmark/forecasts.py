@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.data.files import atomic_file
-from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.envs.mujoco.motion_check import PREDICTION
+from robo_manip_baselines.envs.mujoco.face.motion import PREDICTION, MotionLibrary
 from robo_manip_baselines.observation import MAX_HORIZON
 
 

@@ -12,10 +12,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from robo_manip_baselines.benchmark import work
-from robo_manip_baselines.benchmark.schedule import Outcome
-from robo_manip_baselines.benchmark.store import LOG, Store
-from robo_manip_baselines.benchmark.unit import Unit
+from robo_manip_baselines.benchmark import worker as work
+from robo_manip_baselines.benchmark.scheduler import Outcome
+from robo_manip_baselines.benchmark.work_item import LOG, Store, Unit
 
 POLL = 0.05
 """s between looks at the processes, up to ten times that while nothing happens."""

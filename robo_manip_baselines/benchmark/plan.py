@@ -6,18 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from robo_manip_baselines.benchmark.arm_file import ArmLine
+from robo_manip_baselines.benchmark.conditions import ArmLine
 from robo_manip_baselines.benchmark.presets import Preset
-from robo_manip_baselines.benchmark.unit import InputFile, Unit
-from robo_manip_baselines.benchmark.work import FORECAST, LIBRARY, STATS
-from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.evaluation import FIRST_SEED
-from robo_manip_baselines.evaluation.result import EpisodeResult
+from robo_manip_baselines.benchmark.work_item import InputFile, Unit
+from robo_manip_baselines.benchmark.worker import FORECAST, LIBRARY, STATS
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.observation.error_stats import load_error_stats
+from robo_manip_baselines.rollout.evaluation import FIRST_SEED
+from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.runs.errors import RequestError
 
-_WORK = "robo_manip_baselines.benchmark.work"
+_WORK = "robo_manip_baselines.benchmark.worker"
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.paper_results import PAPER
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)

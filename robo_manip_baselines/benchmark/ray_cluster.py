@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from robo_manip_baselines.benchmark.local import last_line, start_worker
-from robo_manip_baselines.benchmark.schedule import Outcome
-from robo_manip_baselines.benchmark.store import LOG, Store, read_note
-from robo_manip_baselines.benchmark.unit import MOUNTS, OUT, Unit
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.benchmark.scheduler import Outcome
+from robo_manip_baselines.benchmark.work_item import LOG, MOUNTS, OUT, Store, Unit, read_note
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

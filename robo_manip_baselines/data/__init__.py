@@ -3,9 +3,11 @@
 from robo_manip_baselines.data.episode import (
     EpisodeFileError,
     EpisodeReader,
+    decode_image,
+    encode_image,
     read_metadata,
+    write_episode,
 )
-from robo_manip_baselines.data.episode_writer import write_episode
 from robo_manip_baselines.data.files import (
     atomic_file,
     episode_path,
@@ -14,7 +16,6 @@ from robo_manip_baselines.data.files import (
     prepare_folder,
     remove_temporaries,
 )
-from robo_manip_baselines.data.images import decode_image, encode_image
 
 __all__ = [
     "EpisodeFileError",

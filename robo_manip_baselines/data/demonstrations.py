@@ -1,7 +1,6 @@
-"""A folder of episodes as one policy sees them: what is observed, and what was done.
+"""The truth that an episode file holds, ready for `observe`.
 
-Legend: E episodes, T steps of an episode, S elements of all observed vectors together, A elements
-of an action.
+Legend: T control steps, A arms (left before right), K = 6 frames from now to the longest horizon.
 """
 
 from __future__ import annotations
@@ -9,8 +8,9 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,103 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.data.episode import EpisodeReader, read_metadata
 from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_episodes, seed_of
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec, observe
 from robo_manip_baselines.observation.detector import NO_PREDICTION, Detector
-from robo_manip_baselines.observation.recorded import recorded_truth
-from robo_manip_baselines.observation.vector import to_vector
+from robo_manip_baselines.observation.state import Truth, to_vector
+from robo_manip_baselines.runs.errors import RequestError
+
+
+def recorded_truth(episode: EpisodeReader) -> Truth:
+    """Read the (T, ...) truth of an episode of one arm or of both.
+
+    Raises:
+        EpisodeFileError: a field is missing or damaged.
+    """
+    gripper_position = episode.array("gripper_position")
+    arms = gripper_position.shape[1]
+
+    return Truth(
+        time=episode.array("time"),
+        joint_position=episode.array("joint_position").reshape(len(episode), arms, -1),
+        joint_velocity=episode.array("joint_velocity").reshape(len(episode), arms, -1),
+        gripper_position=gripper_position,
+        gripper_velocity=episode.array("gripper_velocity"),
+        end_effector_position=episode.array("end_effector_position"),
+        mouth_position=episode.array("mouth_position"),
+        object_position=episode.array("object_pose")[:, :3],
+        predicted_mouth=(
+            episode.array("predicted_mouth") if "predicted_mouth" in episode.fields else None
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Split:
+    """Episodes by the seed that each was recorded with, so that it names them in any folder.
+
+    Attributes:
+        train: seeds of the training episodes, ascending.
+        validation: seeds of the episodes held out, ascending; perhaps none.
+    """
+
+    train: tuple[int, ...]
+    validation: tuple[int, ...]
+
+    def to_json(self) -> dict[str, list[int]]:
+        """Return what `from_json` takes, made of plain lists."""
+        return {"train": list(self.train), "validation": list(self.validation)}
+
+    @classmethod
+    def from_json(cls, data: Any) -> Split:
+        """Undo `to_json`.
+
+        Raises:
+            RequestError: ``data`` is no split.
+        """
+        parts: list[tuple[int, ...]] = []
+        for name in ("train", "validation"):
+            seeds = data.get(name) if isinstance(data, dict) else None
+            if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
+                raise RequestError(f"a split needs '{name}', a list of seeds, not {seeds!r}")
+            parts.append(tuple(seeds))
+        train, validation = parts
+        if not train or set(train) & set(validation):
+            raise RequestError(
+                "a split needs at least one training seed, and none in both of its parts"
+            )
+        return cls(train, validation)
+
+
+def split_episodes(seeds: Iterable[int], fraction: float, seed: int) -> Split:
+    """Hold out a random share of the episodes.
+
+    The result depends on which seeds there are, not on their order.
+
+    Args:
+        seeds: of the episodes, all different.
+        fraction: share to hold out, 0 or more and less than 1, rounded to whole episodes. More
+            than 0 holds out at least one episode wherever one is left to train on.
+        seed: of the draw.
+
+    Raises:
+        RequestError: there is no episode, a seed is there twice, or a number is out of range.
+    """
+    ordered = sorted(seeds)
+    if not ordered:
+        raise RequestError("no episode to train on; record some first")
+    if len(set(ordered)) < len(ordered):
+        twice = next(a for a, b in pairwise(ordered) if a == b)
+        raise RequestError(f"episode seed {twice} is there twice; each may be there once")
+    if not 0.0 <= fraction < 1.0:
+        raise RequestError(f"validation fraction {fraction}: must be 0 or more, less than 1")
+    if seed < 0:
+        raise RequestError(f"seed {seed}: must be 0 or more")
+    held_out = round(fraction * len(ordered))
+    if fraction > 0.0:
+        held_out = min(max(held_out, 1), len(ordered) - 1)
+    shuffled = np.random.default_rng([seed, *b"split"]).permutation(ordered).tolist()
+    return Split(tuple(sorted(shuffled[held_out:])), tuple(sorted(shuffled[:held_out])))
+
 
 SHARED = (
     "env_id",

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robo_manip_baselines.data.images import encode_image
+from robo_manip_baselines.data.episode import encode_image
 from robo_manip_baselines.data.schema import FIELDS, fields_of
 
 

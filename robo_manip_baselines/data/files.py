@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 FAILED_FOLDER = "failed"
 _EPISODE_NAME = re.compile(r"episode_(\d{6,})\.hdf5")

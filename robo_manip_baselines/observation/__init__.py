@@ -2,7 +2,7 @@
 
 from robo_manip_baselines.observation.corruption import ERRORS, Corruption
 from robo_manip_baselines.observation.spec import CAMERAS, MAX_HORIZON, PRESETS, ObservationSpec
-from robo_manip_baselines.observation.truth import FRAME_PERIOD, Report, Truth, observe
+from robo_manip_baselines.observation.state import FRAME_PERIOD, Report, Truth, observe
 
 __all__ = [
     "CAMERAS",

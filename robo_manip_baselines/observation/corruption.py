@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from robo_manip_baselines.errors import RequestError, require_choice
 from robo_manip_baselines.observation.error_stats import load_error_stats
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 MEASURED_ERRORS = ("uniform", "gaussian", "empirical")
 """Errors of the forecast that are drawn, with the statistics of a file."""

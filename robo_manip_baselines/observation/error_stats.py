@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 SCHEMA = "error_stats"
 VERSION = 1

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robo_manip_baselines.data.demonstrations import Split
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.data.split import Split
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.policy.checkpoint_files import (
+from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
+from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
+from robo_manip_baselines.runs.checkpoints import (
     find_checkpoint,
     read_json,
     read_manifest,
@@ -25,16 +26,14 @@ from robo_manip_baselines.policy.checkpoint_files import (
     whole_folder,
     write_json,
 )
-from robo_manip_baselines.policy.presets import Acting
-from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
-from robo_manip_baselines.policy.sizes import Sizes
-from robo_manip_baselines.training.settings import TrainSettings
+from robo_manip_baselines.runs.errors import RequestError
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
     from robo_manip_baselines.policy.interface import PolicyModel
+
 
 MODEL = "model.safetensors"
 CONFIG = "config.json"

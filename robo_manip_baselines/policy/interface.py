@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from robo_manip_baselines.policy.sizes import Sizes
+from robo_manip_baselines.policy.presets import Sizes
 
 __all__ = ["Batch", "PolicyModel", "Sizes", "masked_mean"]
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from robo_manip_baselines.errors import require_choice
+from robo_manip_baselines.runs.errors import require_choice
 
 if TYPE_CHECKING:
     from robo_manip_baselines.policy.interface import PolicyModel
-    from robo_manip_baselines.policy.sizes import Sizes
+    from robo_manip_baselines.policy.presets import Sizes
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ POLICIES: dict[str, PolicyEntry] = {
     "Act": PolicyEntry(
         "robo_manip_baselines.policy.act.config:ActConfig",
         "robo_manip_baselines.policy.act.model:ActModel",
-        "robo_manip_baselines.policy.act.presets:PRESETS",
+        "robo_manip_baselines.policy.act.config:PRESETS",
     ),
     "Mlp": PolicyEntry(
         "robo_manip_baselines.policy.mlp.config:MlpConfig",

@@ -11,19 +11,18 @@ from typing import Any, Generic, TypeVar
 
 import tyro
 
-from robo_manip_baselines.command import parse
-from robo_manip_baselines.envs.mujoco.registration import ENVS
-from robo_manip_baselines.errors import RequestError, require_choice
+from robo_manip_baselines.envs.mujoco.tasks.registry import ENVS
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.options import (
+from robo_manip_baselines.observation.spec import (
     CorruptionOptions,
     parse_cameras,
     parse_image_size,
 )
-from robo_manip_baselines.policy.presets import PolicyPreset
+from robo_manip_baselines.policy.presets import PolicyPreset, TrainSettings
 from robo_manip_baselines.policy.registry import POLICIES, load_part, policy_entry
+from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.training.run_folder import CONFIG, read_config
-from robo_manip_baselines.training.settings import TrainSettings
 
 Network = TypeVar("Network")
 

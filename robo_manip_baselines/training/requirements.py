@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 PACKAGES = {
     "torch": "torch",

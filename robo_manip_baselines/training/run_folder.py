@@ -13,8 +13,8 @@ from typing import Any
 import yaml
 
 from robo_manip_baselines.data.files import atomic_file, prepare_folder
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.checkpoint_files import list_checkpoints
+from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.errors import RequestError
 
 CONFIG = "config.yaml"
 METRICS = "metrics.jsonl"

@@ -1,22 +1,86 @@
-"""One step of training: forward, backward, optimiser. No host synchronisation."""
+"""AdamW, its learning rate as a function of the step, and the moving average of the weights."""
 
 from __future__ import annotations
+
+import copy
+import math
 
 import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
-from robo_manip_baselines.training.distributed import Processes
-from robo_manip_baselines.training.optimizer import (
-    WeightAverage,
-    learning_rate_factor,
-    make_optimizer,
-    set_learning_rate,
-)
-from robo_manip_baselines.training.phases import PhaseClock
-from robo_manip_baselines.training.seeds import derive_seed
-from robo_manip_baselines.training.settings import TrainSettings
+from robo_manip_baselines.policy.presets import TrainSettings
+from robo_manip_baselines.runs.seeds import derive_seed
+from robo_manip_baselines.training.device import Processes
+from robo_manip_baselines.training.timing import PhaseClock
+
+
+def make_optimizer(model: PolicyModel, settings: TrainSettings) -> torch.optim.AdamW:
+    """Make AdamW over the policy's parameter groups, fused where the device has it."""
+    fused = next(model.parameters()).device.type in ("cpu", "cuda")
+    optimizer = torch.optim.AdamW(
+        model.parameter_groups(settings.learning_rate),  # pyright: ignore[reportArgumentType]
+        lr=settings.learning_rate,
+        weight_decay=settings.weight_decay,
+        fused=fused,
+    )
+    for group in optimizer.param_groups:
+        group["initial_lr"] = group["lr"]
+    return optimizer
+
+
+def learning_rate_factor(step: int, total_steps: int, settings: TrainSettings) -> float:
+    """Return what a step (from 0 on) multiplies the learning rate by.
+
+    The warm-up rises linearly and reaches 1 at step ``warmup_steps``; ``cosine`` then falls from 1
+    to 0, which it would reach one step after the last.
+    """
+    if step < settings.warmup_steps:
+        return (step + 1) / (settings.warmup_steps + 1)
+    if settings.schedule == "constant":
+        return 1.0
+    length = max(total_steps - settings.warmup_steps, 1)
+    progress = min((step - settings.warmup_steps) / length, 1.0)
+    return 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, factor: float) -> None:
+    """Give every group its own learning rate times ``factor``."""
+    for group in optimizer.param_groups:
+        group["lr"] = group["initial_lr"] * factor
+
+
+class WeightAverage:
+    """Exponential moving average of a network's weights.
+
+    The decay of step n (from 0 on) is min(decay, (1 + n) / (10 + n)), as is usual, so that the
+    random initial weights are soon forgotten; it depends on the step alone.
+
+    Attributes:
+        model: a copy of the network with the averaged weights.
+    """
+
+    def __init__(self, model: PolicyModel, decay: float) -> None:
+        self.model = copy.deepcopy(model).eval().requires_grad_(False)
+        self._decay = decay
+        self._averages: list[torch.Tensor] = list(self.model.parameters())
+        self._weights: list[torch.Tensor] = list(model.parameters())
+        self._source: nn.Module = model
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        """Take in the weights after a step; no host synchronisation."""
+        decay = min(self._decay, (1 + step) / (10 + step))
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
+            self._averages, self._weights, 1.0 - decay
+        )
+
+    @torch.no_grad()
+    def copy_buffers(self) -> None:
+        """Take over what is no weight, such as running statistics."""
+        for mine, theirs in zip(self.model.buffers(), self._source.buffers(), strict=True):
+            mine.copy_(theirs)
 
 
 class LossOf(nn.Module):

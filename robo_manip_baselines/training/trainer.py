@@ -1,27 +1,220 @@
-"""The loop: batches through `TrainStep`, and what is written on the way."""
+"""What training needs beside the evaluated weights to go on exactly: flat tensors and JSON.
+
+Tensors are named ``weights/NAME`` (only where an average is what is evaluated),
+``exp_avg/NAME`` and ``exp_avg_sq/NAME`` (AdamW), and ``metrics`` (sums since the last line of
+``metrics.jsonl``); NAME is the parameter's name in the network.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import logging
+import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
+import safetensors.torch
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.checkpoint import write_checkpoint
-from robo_manip_baselines.policy.checkpoint_files import step_folder
-from robo_manip_baselines.training.distributed import Processes
-from robo_manip_baselines.training.job import Job
-from robo_manip_baselines.training.metrics import MetricsLog
-from robo_manip_baselines.training.parts import Parts
+from robo_manip_baselines.data.demonstrations import Demonstrations
+from robo_manip_baselines.policy.checkpoint import MODEL, Checkpoint, read_trainer, write_checkpoint
+from robo_manip_baselines.runs.checkpoints import step_folder
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.metrics import MetricsLog, RunningMean
+from robo_manip_baselines.training.batching import BatchLoader
+from robo_manip_baselines.training.device import Processes, autocast_type
+from robo_manip_baselines.training.images import FrameSource, free_memory
 from robo_manip_baselines.training.run_folder import prune
-from robo_manip_baselines.training.trainer_state import Progress, trainer_state
+from robo_manip_baselines.training.sampling import StateNoise
+from robo_manip_baselines.training.setup import Job
+from robo_manip_baselines.training.step import TrainStep
+from robo_manip_baselines.training.validation import Validation
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run has come.
+
+    Attributes:
+        step: optimiser steps done.
+        seconds: spent on them, by all processes that took part in turn.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+
+
+def trainer_state(
+    train_step: TrainStep, mean: RunningMean, progress: Progress
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return what `restore` takes."""
+    tensors: dict[str, Tensor] = {}
+    if train_step.average:
+        tensors |= {f"weights/{k}": v for k, v in train_step.model.state_dict().items()}
+    steps: dict[str, int] = {}
+    for name, parameter in _trained(train_step):
+        if state := train_step.optimizer.state.get(parameter):
+            tensors |= {f"{moment}/{name}": state[moment] for moment in _MOMENTS}
+            steps[name] = int(state["step"])
+    if mean.sums is not None:
+        tensors["metrics"] = mean.sums
+    # Every trained parameter has made as many steps as the others, unless some get no gradient.
+    json = {
+        "step": progress.step,
+        "seconds": progress.seconds,
+        "optimizer_steps": steps,
+        "metrics": {"names": list(mean.names), "count": mean.count},
+    }
+    return tensors, json
+
+
+@torch.no_grad()
+def restore(
+    train_step: TrainStep,
+    mean: RunningMean,
+    model_state: Mapping[str, Tensor],
+    tensors: Mapping[str, Tensor],
+    json: Mapping[str, Any],
+) -> Progress:
+    """Put a fresh `TrainStep` where another one was.
+
+    Args:
+        train_step: of the same network and settings; changed.
+        mean: changed.
+        model_state: the checkpoint's evaluated weights.
+        tensors: as `trainer_state` gave them.
+        json: the same.
+    """
+    online = model_state
+    if train_step.average:
+        train_step.average.model.load_state_dict(model_state)
+        online = {
+            name.removeprefix("weights/"): tensor
+            for name, tensor in tensors.items()
+            if name.startswith("weights/")
+        }
+    train_step.model.load_state_dict(online)
+    fused = bool(train_step.optimizer.defaults["fused"])
+    for name, parameter in _trained(train_step):
+        if name not in json["optimizer_steps"]:
+            continue
+        device = parameter.device if fused else "cpu"
+        # In the memory layout of the parameter, as AdamW itself makes them.
+        moments = {m: torch.empty_like(parameter).copy_(tensors[f"{m}/{name}"]) for m in _MOMENTS}
+        count = torch.tensor(float(json["optimizer_steps"][name]), device=device)
+        train_step.optimizer.state[parameter] = {"step": count, **moments}
+    mean.names = tuple(json["metrics"]["names"])
+    mean.count = json["metrics"]["count"]
+    mean.sums = tensors["metrics"].to(train_step.device) if mean.count else None
+    return Progress(json["step"], json["seconds"])
+
+
+def _trained(train_step: TrainStep) -> Iterator[tuple[str, torch.nn.Parameter]]:
+    grouped = {id(p) for group in train_step.optimizer.param_groups for p in group["params"]}
+    for name, parameter in train_step.model.named_parameters():
+        if id(parameter) in grouped:
+            yield name, parameter
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a run is carried out with.
+
+    Attributes:
+        train_step: the network with its optimiser, where training begins or goes on.
+        mean: of the losses since they were last written.
+        progress: how far the run has come.
+        loader: of the training batches.
+        validation: None without episodes held out, and in all processes but the first.
+    """
+
+    train_step: TrainStep
+    mean: RunningMean
+    progress: Progress
+    loader: BatchLoader
+    validation: Validation | None
+
+
+@contextmanager
+def assembled(
+    job: Job, start: Checkpoint | None, device: torch.device, processes: Processes
+) -> Iterator[Parts]:
+    """Put the parts of a run together; images are held or read while the block lasts.
+
+    Args:
+        job: what to train on what.
+        start: where to go on from, None to begin.
+        device: to train on.
+        processes: that train together.
+
+    Raises:
+        RequestError: the network cannot be built, the device lacks the precision, or the
+            checkpoint has lost what training needs.
+    """
+    settings, seed = job.options.training, job.options.seed
+    autocast = autocast_type(settings.precision, device, bool(job.sizes.cameras))
+    model = job.make_model(is_start=start is None).to(device)
+    train_step = TrainStep(
+        model,
+        settings,
+        total_steps=job.total_steps,
+        seed=seed,
+        autocast=autocast,
+        processes=processes,
+    )
+    mean, progress = RunningMean(), Progress()
+    if start:
+        weights = safetensors.torch.load_file(start.folder / MODEL)
+        progress = restore(train_step, mean, weights, *read_trainer(start))
+    with _frames(job.demonstrations) as frames:
+        loader = BatchLoader(
+            job.demonstrations,
+            job.normalization,
+            job.demonstrations.indices(job.split.train),
+            job.schedule,
+            chunk_size=model.chunk_size,
+            noise_size=model.noise_size,
+            state_noise=StateNoise.of(job.demonstrations.spec, settings),
+            seed=seed,
+            device=device,
+            rank=processes.rank,
+            world_size=processes.world_size,
+            frames=frames,
+        )
+        validation = None
+        if job.split.validation and processes.is_main:
+            validation = Validation(
+                job.demonstrations,
+                job.normalization,
+                frames,
+                episodes=job.demonstrations.indices(job.split.validation),
+                batch_size=settings.batch_size,
+                seed=seed,
+                model=model,
+                device=device,
+                autocast=autocast,
+            )
+        yield Parts(train_step, mean, progress, loader, validation)
+
+
+def _frames(
+    demonstrations: Demonstrations,
+) -> contextlib.AbstractContextManager[FrameSource | None]:
+    if not demonstrations.spec.cameras:
+        return contextlib.nullcontext()
+    # Half of what is free is the source's own measure; the processes of one machine share it.
+    share = free_memory() // 2 // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return FrameSource(demonstrations, memory_budget=share)
+
 
 logger = logging.getLogger(__name__)
 

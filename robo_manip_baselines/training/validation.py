@@ -9,10 +9,10 @@ import torch
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.policy.interface import PolicyModel
-from robo_manip_baselines.training.frames import FrameSource
-from robo_manip_baselines.training.loader import BatchLoader
-from robo_manip_baselines.training.schedule import Schedule
-from robo_manip_baselines.training.seeds import derive_seed
+from robo_manip_baselines.runs.seeds import derive_seed
+from robo_manip_baselines.training.batching import BatchLoader
+from robo_manip_baselines.training.images import FrameSource
+from robo_manip_baselines.training.sampling import Schedule
 
 STARTS = 8
 """Examples of each episode: enough for a smooth curve, a small share of training's time."""

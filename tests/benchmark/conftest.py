@@ -9,15 +9,13 @@ from pathlib import Path
 import pytest
 
 from robo_manip_baselines.benchmark import plan as plan_module
-from robo_manip_baselines.benchmark.arm_file import ArmLine
+from robo_manip_baselines.benchmark.aggregation import write_outcome, write_results
+from robo_manip_baselines.benchmark.conditions import ArmLine
 from robo_manip_baselines.benchmark.local import LocalExecutor
-from robo_manip_baselines.benchmark.outcome import write_outcome, write_results
 from robo_manip_baselines.benchmark.plan import Plan, make_plan
 from robo_manip_baselines.benchmark.presets import Preset
-from robo_manip_baselines.benchmark.progress import Progress
-from robo_manip_baselines.benchmark.schedule import run_units
-from robo_manip_baselines.benchmark.store import Store
-from robo_manip_baselines.benchmark.unit import Unit
+from robo_manip_baselines.benchmark.scheduler import Progress, run_units
+from robo_manip_baselines.benchmark.work_item import Store, Unit
 
 STUB = '''
 """Work that is done in an instant, or in as many steps as a test wants to look at."""
@@ -70,7 +68,7 @@ def train(settings):
 
 def evaluate(settings):
     """A line for each seed; those that are there already are not done again."""
-    from robo_manip_baselines.evaluation.result import EpisodeResult
+    from robo_manip_baselines.rollout.results import EpisodeResult
 
     state, _ = json.loads(Path("run/state.json").read_text())
     OUT.mkdir(exist_ok=True)

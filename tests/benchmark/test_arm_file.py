@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.benchmark.arm_file import ARMS, ArmLine, choose_arms, read_arms
+from robo_manip_baselines.benchmark.conditions import ARMS, ArmLine, choose_arms, read_arms
 from robo_manip_baselines.benchmark.presets import PRESETS
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.paper_results import PAPER
-from robo_manip_baselines.evaluation.statistics.arms import FURTHER, PREDICTION
+from robo_manip_baselines.benchmark.statistics.conditions import FURTHER, PREDICTION
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.options import parse_options
 
 

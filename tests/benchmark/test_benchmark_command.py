@@ -13,17 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robo_manip_baselines.benchmark import command
-from robo_manip_baselines.benchmark.arm_file import ARMS
-from robo_manip_baselines.benchmark.command import benchmark, plan_of
+from robo_manip_baselines.benchmark.conditions import ARMS
 from robo_manip_baselines.benchmark.forecasts import write_library
-from robo_manip_baselines.benchmark.options import EXAMPLE, BenchmarkOptions
-from robo_manip_baselines.benchmark.store import Store
-from robo_manip_baselines.benchmark.unit import source_digest
-from robo_manip_baselines.command import parse
-from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
-from robo_manip_baselines.envs.mujoco.motion_check import PREDICTION
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.benchmark.work_item import Store, source_digest
+from robo_manip_baselines.commands import benchmark as command
+from robo_manip_baselines.commands.benchmark import EXAMPLE, BenchmarkOptions, benchmark, plan_of
+from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY, PREDICTION
+from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import ARMS as STUB_ARMS
 from .conftest import PRESET, outcome
@@ -137,7 +134,7 @@ def test_a_dry_run_counts_and_writes_nothing(
 @pytest.fixture
 def stub_command(stub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkOptions:
     """A command whose preset and arms are the stub's."""
-    from robo_manip_baselines.benchmark import options as options_module
+    from robo_manip_baselines.commands import benchmark as options_module
 
     arms = tmp_path / "stub.yaml"
     arms.write_text(

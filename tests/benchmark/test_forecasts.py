@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.benchmark.forecasts import FORECASTS, write_library
-from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.envs.mujoco.registration import make_env
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,11 @@ from typing import Any
 
 import pytest
 
-from robo_manip_baselines.benchmark import work
+from robo_manip_baselines.benchmark import worker as work
 from robo_manip_baselines.benchmark.local import LocalExecutor, start_worker
 from robo_manip_baselines.benchmark.plan import Plan
-from robo_manip_baselines.benchmark.progress import Progress
-from robo_manip_baselines.benchmark.schedule import Outcome, UnitsFailedError, run_units
-from robo_manip_baselines.benchmark.store import Store, write_note
+from robo_manip_baselines.benchmark.scheduler import Outcome, Progress, UnitsFailedError, run_units
+from robo_manip_baselines.benchmark.work_item import Store, write_note
 
 from .conftest import do, outcome
 

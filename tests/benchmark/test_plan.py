@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robo_manip_baselines.benchmark import unit as unit_module
-from robo_manip_baselines.benchmark.arm_file import ARMS, ArmLine, read_arms
+from robo_manip_baselines.benchmark import work_item as unit_module
+from robo_manip_baselines.benchmark.conditions import ARMS, ArmLine, read_arms
 from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.plan import Plan, make_plan
 from robo_manip_baselines.benchmark.presets import PRESETS, Preset
-from robo_manip_baselines.benchmark.unit import Unit
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.result import EpisodeResult
+from robo_manip_baselines.benchmark.work_item import Unit
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
+from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.runs.errors import RequestError
 
 PRESET = Preset("cpu", (), demonstrations=4, demonstration_block=2, num_episodes=6, episode_block=3)
 CURRENT = ArmLine("current", obs="current")

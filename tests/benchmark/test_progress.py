@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from robo_manip_baselines.benchmark.progress import Progress, spelt
-from robo_manip_baselines.benchmark.unit import Unit
+from robo_manip_baselines.benchmark.scheduler import Progress, spelt
+from robo_manip_baselines.benchmark.work_item import Unit
 
 
 class Clock:

@@ -11,13 +11,12 @@ from typing import Any
 
 import pytest
 
-from robo_manip_baselines.benchmark.outcome import write_outcome, write_results
+from robo_manip_baselines.benchmark.aggregation import write_outcome, write_results
 from robo_manip_baselines.benchmark.plan import Plan
-from robo_manip_baselines.benchmark.progress import Progress
 from robo_manip_baselines.benchmark.ray_cluster import RayExecutor
-from robo_manip_baselines.benchmark.schedule import Outcome, run_units
-from robo_manip_baselines.benchmark.store import Store
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.benchmark.scheduler import Outcome, Progress, run_units
+from robo_manip_baselines.benchmark.work_item import Store
+from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import outcome
 

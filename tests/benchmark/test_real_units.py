@@ -12,15 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.benchmark.arm_file import ArmLine
+from robo_manip_baselines.benchmark.aggregation import write_results
+from robo_manip_baselines.benchmark.conditions import ArmLine
 from robo_manip_baselines.benchmark.local import LocalExecutor
-from robo_manip_baselines.benchmark.outcome import write_results
 from robo_manip_baselines.benchmark.plan import make_plan
 from robo_manip_baselines.benchmark.presets import Preset
-from robo_manip_baselines.benchmark.progress import Progress
-from robo_manip_baselines.benchmark.schedule import run_units
-from robo_manip_baselines.benchmark.store import Store
-from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
+from robo_manip_baselines.benchmark.scheduler import Progress, run_units
+from robo_manip_baselines.benchmark.work_item import Store
+from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
 from robo_manip_baselines.policy.checkpoint import read_checkpoint

@@ -10,11 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robo_manip_baselines.benchmark.progress import Progress
-from robo_manip_baselines.benchmark.schedule import Outcome, UnitsFailedError, run_units
-from robo_manip_baselines.benchmark.store import Store
-from robo_manip_baselines.benchmark.unit import Unit
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.benchmark.scheduler import Outcome, Progress, UnitsFailedError, run_units
+from robo_manip_baselines.benchmark.work_item import Store, Unit
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def unit(name: str, *needs: Unit, kind: str = "training") -> Unit:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from robo_manip_baselines.commands.dataset import dataset_info
 from robo_manip_baselines.data import episode_path, write_episode
-from robo_manip_baselines.data.dataset_command import dataset_info
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 
 SCRIPT = Path(__file__).parents[2] / "bin" / "Dataset.py"

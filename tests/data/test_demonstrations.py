@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
-from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
+from robo_manip_baselines.data.demonstrations import (
+    Demonstrations,
+    load_demonstrations,
+    recorded_truth,
+    split_episodes,
+)
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.data.split import split_episodes
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec, observe
-from robo_manip_baselines.observation.recorded import recorded_truth
+from robo_manip_baselines.runs.errors import RequestError
 
 BLIND = ObservationSpec(obs="current_pred", cameras=(), object_pose=True)
 SHOWN = ObservationSpec(cameras=("top",), image_size=(24, 32))

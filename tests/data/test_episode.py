@@ -24,9 +24,9 @@ from robo_manip_baselines.data.example import (
     make_frames,
     make_images,
 )
-from robo_manip_baselines.data.file_check import verify_file
 from robo_manip_baselines.data.schema import ATTRIBUTES, FIELDS
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.data.verify import verify_file
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "png", "raw"])
@@ -166,7 +166,7 @@ def test_failure_while_writing_leaves_what_was_there(
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("robo_manip_baselines.data.episode_writer._write_frames", fail)
+    monkeypatch.setattr("robo_manip_baselines.data.episode._write_frames", fail)
     with pytest.raises(OSError, match="No space left"):
         write_episode(path, make_arrays(), make_images(), make_attributes())
     assert [child.name for child in tmp_path.iterdir()] == ["a.hdf5"]

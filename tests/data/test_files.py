@@ -22,7 +22,7 @@ from robo_manip_baselines.data import (
 )
 from robo_manip_baselines.data.files import seed_of
 from robo_manip_baselines.data.verify import verify_dataset
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @pytest.mark.parametrize(

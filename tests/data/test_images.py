@@ -7,7 +7,7 @@ import pytest
 
 from robo_manip_baselines.data import decode_image, encode_image
 from robo_manip_baselines.data.example import make_frames
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @pytest.mark.parametrize("codec", ["png", "raw"])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robo_manip_baselines.data.normalization import SMALLEST_STD, Normalization
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
 POSITIVE = st.floats(min_value=2.0**-126, width=32, allow_infinity=False)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.data.split import Split, split_episodes
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.data.demonstrations import Split, split_episodes
+from robo_manip_baselines.runs.errors import RequestError
 
 SEEDS = st.lists(st.integers(0, 10**6), min_size=1, max_size=60, unique=True)
 FRACTION = st.floats(0.0, 1.0, exclude_max=True)

@@ -15,17 +15,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from robo_manip_baselines.data import EpisodeReader, encode_image, episode_path, write_episode
-from robo_manip_baselines.data.attributes import content_digest, loaded_attribute
+from robo_manip_baselines.data.episode import image_checksum
 from robo_manip_baselines.data.example import (
     make_arrays,
     make_attributes,
     make_frames,
     make_images,
 )
-from robo_manip_baselines.data.images import image_checksum
-from robo_manip_baselines.data.schema import ATTRIBUTES, fields_of
+from robo_manip_baselines.data.schema import ATTRIBUTES, content_digest, fields_of, loaded_attribute
 from robo_manip_baselines.data.verify import damage_summary, verify_dataset, verify_file
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

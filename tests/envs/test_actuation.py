@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.scene import (
+from robo_manip_baselines.envs.mujoco.cell.scene import (
     ARM_BASES,
     CUBE_SIZE,
 )
-from robo_manip_baselines.envs.mujoco.vx300s import (
+from robo_manip_baselines.envs.mujoco.cell.vx300s import (
     ARM_JOINTS,
     FINGER_CLOSED,
     FINGER_OPEN,

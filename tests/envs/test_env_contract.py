@@ -11,8 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import robo_manip_baselines  # noqa: F401  (registers the environments)
-from robo_manip_baselines.envs.mujoco.registration import ENVS, env_id, make_env
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.envs.mujoco.tasks.registry import ENVS, env_id, make_env
+from robo_manip_baselines.runs.errors import RequestError
 
 STEPS = 40
 

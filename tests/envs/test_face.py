@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
+from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
 from robo_manip_baselines.envs.mujoco.face import (
     BODIES,
     MAX_OPENING,
@@ -23,8 +24,7 @@ from robo_manip_baselines.envs.mujoco.face import (
 )
 from robo_manip_baselines.envs.mujoco.face.mesh import face_oval
 from robo_manip_baselines.envs.mujoco.face.model import SURFACE
-from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 MOUTH = np.array(MOUTH_BASE)
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
 from robo_manip_baselines.envs.mujoco.face import (
     BODIES,
     REST_OPENING,
     FaceModel,
 )
-from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 
 MOUTH = np.array(MOUTH_BASE)
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])

@@ -12,14 +12,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
 from robo_manip_baselines.envs.mujoco.face import (
     REST_OPENING,
     FaceModel,
     add_face,
 )
-from robo_manip_baselines.envs.mujoco.face.mesh import head
-from robo_manip_baselines.envs.mujoco.face.texture import encode_png, paint
-from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE
+from robo_manip_baselines.envs.mujoco.face.mesh import encode_png, head, paint
 
 MOUTH = np.array(MOUTH_BASE)
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])

@@ -8,10 +8,10 @@ import mink
 import numpy as np
 import pytest
 
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING
-from robo_manip_baselines.envs.mujoco.feeding_env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.registration import make_env
-from robo_manip_baselines.envs.mujoco.vx300s import FINGER_OPEN, HOME_QPOS
+from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 
 STAY_OPEN = np.array([*HOME_QPOS, FINGER_OPEN], dtype=np.float32)
 

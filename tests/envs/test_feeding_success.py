@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.feeding_success import (
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
     CAVITY_DEPTH,
     CLEAR_DISTANCE,
     LIFT_HEIGHT,

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robo_manip_baselines.envs.mujoco.motion import MotionLibrary, MotionSegment
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, MotionSegment
+from robo_manip_baselines.runs.errors import RequestError
 
 FPS = 30.0
 

@@ -12,11 +12,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco import rendering
-from robo_manip_baselines.envs.mujoco.projection import project, project_points
-from robo_manip_baselines.envs.mujoco.rendering import CameraRenderer
-from robo_manip_baselines.envs.mujoco.scene import build_cell
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.envs.mujoco.cell import rendering
+from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer, project, project_points
+from robo_manip_baselines.envs.mujoco.cell.scene import build_cell
+from robo_manip_baselines.runs.errors import RequestError
 
 # Two cameras with nothing in common, and a red ball of 2 cm as the only thing that is red.
 BALL = (0.12, -0.05, 0.3)
@@ -262,8 +261,8 @@ def test_bad_sizes_are_refused(
 
 NO_CONTEXT = """
 import mujoco
-from robo_manip_baselines.envs.mujoco.rendering import CameraRenderer
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
+from robo_manip_baselines.runs.errors import RequestError
 xml = "<mujoco><worldbody><camera name='eye'/></worldbody></mujoco>"
 model = mujoco.MjModel.from_xml_string(xml)
 data = mujoco.MjData(model)
@@ -300,7 +299,7 @@ def test_no_driver_is_one_clear_line_with_what_to_install() -> None:
 def test_import_needs_no_opengl_and_leaves_the_environment_alone() -> None:
     result = run_python(
         "import os, sys; before = dict(os.environ);"
-        "import robo_manip_baselines.envs.mujoco.rendering;"
+        "import robo_manip_baselines.envs.mujoco.cell.rendering;"
         "assert 'OpenGL' not in sys.modules and 'mujoco.egl' not in sys.modules;"
         "assert os.environ.get('MUJOCO_GL') == before.get('MUJOCO_GL')",
         MUJOCO_GL=None,

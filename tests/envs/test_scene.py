@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.projection import project
-from robo_manip_baselines.envs.mujoco.scene import (
+from robo_manip_baselines.envs.mujoco.cell.rendering import project
+from robo_manip_baselines.envs.mujoco.cell.scene import (
     ARM_BASES,
     FACE,
     MOUTH,
@@ -15,11 +15,11 @@ from robo_manip_baselines.envs.mujoco.scene import (
     look_at,
     require_mujoco,
 )
-from robo_manip_baselines.envs.mujoco.vx300s import (
+from robo_manip_baselines.envs.mujoco.cell.vx300s import (
     ARM_JOINTS,
 )
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @pytest.mark.parametrize("version", ["3.17.0", "3.17.1", "3.18.0", "4.0.1", "4.1.0", "5.0.0"])

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco import vx300s
-from robo_manip_baselines.envs.mujoco.scene import ARM_BASES, build_cell
+from robo_manip_baselines.envs.mujoco.cell import vx300s
+from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, build_cell
 
 PI = math.pi
 FULL_TURN = PI - 0.00001

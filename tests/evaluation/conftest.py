@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 import torch
 
+from robo_manip_baselines.data.demonstrations import Split
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.data.split import Split
-from robo_manip_baselines.envs.mujoco.face_env import world_of
-from robo_manip_baselines.evaluation.task import Task
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
-from robo_manip_baselines.policy.presets import Acting
-from robo_manip_baselines.policy.sizes import Sizes
-from robo_manip_baselines.training.settings import TrainSettings
+from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
+from robo_manip_baselines.rollout.workers import Task
 
 SPEC = ObservationSpec(obs="current_pred", cameras=(), object_pose=True)
 STEPS = 30

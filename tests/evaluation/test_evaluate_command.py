@@ -14,17 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.command import parse
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.arm import arm_name
-from robo_manip_baselines.evaluation.evaluate_command import evaluate
-from robo_manip_baselines.evaluation.evaluation import choose_acting, plan, run_name
-from robo_manip_baselines.evaluation.results_file import read_results
-from robo_manip_baselines.expert.rollout_options import EXAMPLE, PolicyOptions, RolloutOptions
+from robo_manip_baselines.commands.evaluate import evaluate
+from robo_manip_baselines.commands.rollout import EXAMPLE, PolicyOptions, RolloutOptions
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import Checkpoint
 from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.rollout.evaluation import arm_name, choose_acting, plan, run_name
+from robo_manip_baselines.rollout.results import read_results
+from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.evaluation.failure import FAILURES
-from robo_manip_baselines.evaluation.result import EpisodeResult, Offset
-from robo_manip_baselines.evaluation.results_file import ResultsFile
-from robo_manip_baselines.expert.rollout_options import PolicyOptions
-from robo_manip_baselines.observation.options import CorruptionOptions
+from robo_manip_baselines.commands.rollout import PolicyOptions
+from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import FAILURES
+from robo_manip_baselines.observation.spec import CorruptionOptions
 from robo_manip_baselines.policy.checkpoint import Checkpoint
+from robo_manip_baselines.rollout.results import EpisodeResult, Offset, ResultsFile
 
 PAGE = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)

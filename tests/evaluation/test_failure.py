@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from robo_manip_baselines.evaluation.episode_watch import EpisodeWatch
-from robo_manip_baselines.evaluation.failure import FAILURES, failure_kind
-from robo_manip_baselines.evaluation.result import Offset
+from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import FAILURES, failure_kind
+from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import EpisodeWatch
+from robo_manip_baselines.rollout.results import Offset
 
 BELOW = float(np.nextafter(0.06, 0.0))  # m, just at the face
 

@@ -9,8 +9,11 @@ import av
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.face_env import world_of
-from robo_manip_baselines.evaluation.policy_video import (
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.observation.state import to_vector
+from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.rollout.rollout import Recording
+from robo_manip_baselines.rollout.videos import (
     CYAN,
     _dots,
     pick_for_video,
@@ -18,10 +21,7 @@ from robo_manip_baselines.evaluation.policy_video import (
     video_name,
     write_video,
 )
-from robo_manip_baselines.evaluation.result import EpisodeResult
-from robo_manip_baselines.evaluation.rollout import Recording
-from robo_manip_baselines.evaluation.task import Task
-from robo_manip_baselines.observation.vector import to_vector
+from robo_manip_baselines.rollout.workers import Task
 
 MISS = EpisodeResult(
     env="FeedingEnv",

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.result import EpisodeResult
-from robo_manip_baselines.evaluation.results_file import (
+from robo_manip_baselines.rollout.results import (
     MANIFEST,
     RESULTS,
+    EpisodeResult,
     ResultsFile,
     read_results,
 )
+from robo_manip_baselines.runs.errors import RequestError
 
 SETTINGS = {"env": "a/FeedingEnv-v0", "acting": {"execute": 1}, "size": (480, 640)}
 MISS = EpisodeResult(

@@ -16,18 +16,22 @@ import torch
 from numpy.typing import NDArray
 
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.envs.mujoco.feeding_success import MOUTH_TOLERANCE
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.env_workers import WorkerEnvironments, open_environments
-from robo_manip_baselines.evaluation.result import EpisodeResult
-from robo_manip_baselines.evaluation.rollout import Policy, Recording, rollout
-from robo_manip_baselines.evaluation.slots import Environments, Order
-from robo_manip_baselines.evaluation.task import Task
-from robo_manip_baselines.expert.demonstrate import demonstrate
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model
-from robo_manip_baselines.policy.chunk_policy import ChunkPolicy
+from robo_manip_baselines.policy.execution import ChunkPolicy
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.rollout.demonstrate import demonstrate
+from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.rollout.rollout import Policy, Recording, rollout
+from robo_manip_baselines.rollout.workers import (
+    Environments,
+    Order,
+    Task,
+    WorkerEnvironments,
+    open_environments,
+)
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.evaluation.result import EpisodeResult
-from robo_manip_baselines.evaluation.summary import (
+from robo_manip_baselines.rollout.results import (
+    EpisodeResult,
     Share,
     share,
     summarise,

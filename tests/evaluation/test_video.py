@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from robo_manip_baselines.evaluation.video import (
+from robo_manip_baselines.rollout.videos import (
     YELLOW,
     VideoWriter,
     draw_track,

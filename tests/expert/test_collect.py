@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robo_manip_baselines.commands.rollout import RolloutOptions, to_collection
 from robo_manip_baselines.data import (
     EpisodeReader,
     list_episodes,
@@ -24,11 +25,10 @@ from robo_manip_baselines.data import (
 )
 from robo_manip_baselines.data.schema import ATTRIBUTES
 from robo_manip_baselines.data.verify import verify_dataset
-from robo_manip_baselines.envs.mujoco.motion import DEFAULT_LIBRARY
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.episode_replay import deviation
-from robo_manip_baselines.expert.collect import Collection, collect
-from robo_manip_baselines.expert.rollout_command import RolloutOptions, to_collection
+from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
+from robo_manip_baselines.rollout.demonstrate import Collection, collect
+from robo_manip_baselines.rollout.replay import deviation
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

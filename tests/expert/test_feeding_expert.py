@@ -8,11 +8,11 @@ import mink
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.feeding_env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.feeding_success import Phase, Progress
-from robo_manip_baselines.envs.mujoco.registration import make_env
-from robo_manip_baselines.envs.mujoco.scene import MOUTH
-from robo_manip_baselines.expert.feeding import EXPERTS, FeedingExpert
+from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH
+from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS, FeedingExpert
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase, Progress
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 
 
 @pytest.fixture(scope="module", params=["episode", "after_lift"])

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from robo_manip_baselines.envs.mujoco.face_env import FACE_OFFSET
-from robo_manip_baselines.envs.mujoco.motion import MotionLibrary
-from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE, build_cell
-from robo_manip_baselines.envs.mujoco.vx300s import ARM_JOINTS, HOME_QPOS, JOINT_LIMITS
-from robo_manip_baselines.expert.feeding import STANDOFF
-from robo_manip_baselines.expert.kinematics import (
+from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
+from robo_manip_baselines.envs.mujoco.cell.vx300s import ARM_JOINTS, HOME_QPOS, JOINT_LIMITS
+from robo_manip_baselines.envs.mujoco.expert.kinematics import (
     ORIENTATION_TOLERANCE,
     POSITION_TOLERANCE,
     ArmKinematics,
 )
-from robo_manip_baselines.expert.phases import level_at
+from robo_manip_baselines.envs.mujoco.expert.phases import level_at
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
+from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET
+from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import STANDOFF
 
 LIMITS = np.array([JOINT_LIMITS[joint] for joint in ARM_JOINTS])
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.expert.phases import (
+from robo_manip_baselines.envs.mujoco.expert.phases import (
     DOWN,
     Approach,
     Command,

@@ -12,9 +12,9 @@ import av
 import numpy as np
 import pytest
 
-from face_prediction.lifting import CANONICAL_MOUTH, LIPS
-from face_prediction.rigid_pose import rigid_face
-from face_prediction.tracks import NUM_LANDMARKS, FaceTrack
+from face_prediction.tracking.geometry import rigid_face
+from face_prediction.tracking.lifting import CANONICAL_MOUTH, LIPS
+from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack
 
 
 def _project(points: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from face_prediction.cli import main
+from face_prediction.commands.cli import main
 
 
 def python(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -66,7 +66,7 @@ def test_importing_needs_no_detector_display_or_robot(repository: Path) -> None:
     heavy = ("mediapipe", "cv2", "mujoco", "robo_manip_baselines", "matplotlib", "torch", "OpenGL")
     script = (
         f"import sys\nfor name in {heavy}: sys.modules[name] = None\n"
-        "import face_prediction, face_prediction.cli, face_prediction.plots\n"
+        "import face_prediction, face_prediction.commands.cli, face_prediction.motion.report\n"
     )
     result = python("-c", script, cwd=repository)
     assert result.returncode == 0, result.stderr

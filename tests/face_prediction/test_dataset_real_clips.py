@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.cli import main
+from face_prediction.commands.cli import main
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.detector import DetectorSettings, FaceDetector
-from face_prediction.lifting import LIPS
+from face_prediction.tracking.detector import DetectorSettings, FaceDetector
+from face_prediction.tracking.lifting import LIPS
 
 pytestmark = [pytest.mark.shared, pytest.mark.long]
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.dataset.facts import FACTS, largest_angle, sequence_facts
+from face_prediction.dataset.manifest import FACTS, largest_angle, sequence_facts
 from face_prediction.dataset.sequences import clip_frames, find_sequences
 from face_prediction.dataset.settings import SequenceSettings
 from face_prediction.errors import RequestError
-from face_prediction.lifting import LIPS
+from face_prediction.tracking.lifting import LIPS
 
 SETTINGS = SequenceSettings(history=8, future=2, stride=5)
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.attribution import Attribution, read_attributions
-from face_prediction.dataset.kinds import kind_of
-from face_prediction.dataset.split import Amount, assign_folds, fold_split
+from face_prediction.dataset.manifest import Amount, assign_folds, fold_split
+from face_prediction.dataset.settings import kind_of
 from face_prediction.errors import RequestError
+from face_prediction.motion.library import Attribution, read_attributions
 
 
 def totals(amounts, folds, seed=0):

@@ -12,12 +12,12 @@ from face_prediction.errors import RequestError
 from face_prediction.evaluation import (
     cluster_bootstrap,
     mouth_distances,
-    mouth_errors,
     mouth_residuals,
     normalised_mean_errors,
     skill,
 )
-from face_prediction.lifting import LIPS
+from face_prediction.evaluation.errors import mouth_errors
+from face_prediction.tracking.lifting import LIPS
 
 
 def pair_of_faces(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ from face_prediction.evaluation import (
     measure_error_stats,
     save_error_stats,
 )
-from face_prediction.evaluation.residuals import autocorrelation, neighbours
+from face_prediction.evaluation.error_stats import autocorrelation, neighbours
 
 STRIDE = 5
 

@@ -10,15 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from face_prediction.detector import FaceDetection
 from face_prediction.errors import RequestError
-from face_prediction.evaluation.baseline_predictor import BaselinePredictor
+from face_prediction.evaluation.batches import DETECTOR_SIDE, DetectedPredictor, find_landmarks
 from face_prediction.evaluation.calibration import LEVELS, covered, interval_levels
-from face_prediction.evaluation.detected import DETECTOR_SIDE, DetectedPredictor, find_landmarks
-from face_prediction.evaluation.similarity import area_average, similarities
-from face_prediction.forecast.constant_velocity import ConstantVelocity
-from face_prediction.forecast.persistence import Persistence
-from face_prediction.predictor import Forecast, PictureNeeds
+from face_prediction.evaluation.errors import area_average, similarities
+from face_prediction.evaluation.setup import BaselinePredictor
+from face_prediction.forecast.simple import ConstantVelocity, Persistence
+from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.tracking.detector import FaceDetection
 
 
 def pictures(seed: int, size: int = 24) -> np.ndarray:

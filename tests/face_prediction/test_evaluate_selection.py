@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from face_prediction.errors import RequestError
-from face_prediction.evaluation.contestants import common_folds, networks
-from face_prediction.evaluation.selection import exchange_pictures
-from face_prediction.predictor import Forecast, PictureNeeds
+from face_prediction.evaluation.setup import common_folds, exchange_pictures, networks
+from face_prediction.prediction.interface import Forecast, PictureNeeds
 
 
 @dataclass

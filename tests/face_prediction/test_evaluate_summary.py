@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from face_prediction.errors import RequestError
-from face_prediction.evaluation import cluster_bootstrap, mouth_errors, skill
+from face_prediction.evaluation import cluster_bootstrap, skill
 from face_prediction.evaluation.calibration import LEVELS
-from face_prediction.evaluation.contestants import Role
-from face_prediction.evaluation.judge import Judged, Verdict
-from face_prediction.evaluation.results import Evaluation, markdown, results_json, write_results
-from face_prediction.evaluation.selection import Selection
-from face_prediction.evaluation.summary import KindSummary, summarise
+from face_prediction.evaluation.errors import mouth_errors
+from face_prediction.evaluation.scoring import Judged, Verdict
+from face_prediction.evaluation.setup import Role, Selection
+from face_prediction.evaluation.statistics import KindSummary, summarise
+from face_prediction.evaluation.tables import Evaluation, markdown, results_json, write_results
 
 N, H = 30, 5
 

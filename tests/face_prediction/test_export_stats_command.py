@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction import cross_fit as cross_fit_module
-from face_prediction import export_stats_command
-from face_prediction.cli import main
-from face_prediction.crop_scale import camera_with_crop, crop_spans
-from face_prediction.cross_fit import CrossFit, Fitted, batch_size, cross_fit
-from face_prediction.dataset.crop import crop_around
+from face_prediction.commands import export_stats as export_stats_command
+from face_prediction.commands.cli import main
+from face_prediction.commands.export_stats import ExportStatsOptions, run_export_stats
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.errors import RequestError
 from face_prediction.evaluation import Camera, load_error_stats
-from face_prediction.export_stats_command import ExportStatsOptions, run_export_stats
-from face_prediction.library import MotionLibrary, save_library
-from face_prediction.predictor import Forecast, PictureNeeds
-from face_prediction.tracks import save_track
-from face_prediction.video import sha256_of
+from face_prediction.evaluation import setup as cross_fit_module
+from face_prediction.evaluation.library_errors import camera_with_crop, crop_spans
+from face_prediction.evaluation.setup import CrossFit, Fitted, batch_size, cross_fit
+from face_prediction.motion.library import MotionLibrary, save_library
+from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.tracking.crop import crop_around
+from face_prediction.tracking.tracks import save_track
+from face_prediction.tracking.video import sha256_of
 
 pytestmark = pytest.mark.long
 

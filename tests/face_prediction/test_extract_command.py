@@ -11,13 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction import detector as detector_module
-from face_prediction import extract_command, model_file
-from face_prediction.cli import main
-from face_prediction.detector import DetectorSettings, FaceDetection, FaceDetector
+from face_prediction.commands import extract as extract_command
+from face_prediction.commands.cli import main
 from face_prediction.errors import RequestError
-from face_prediction.model_file import default_model_path, find_model
-from face_prediction.tracks import load_track
+from face_prediction.tracking import detector as detector_module
+from face_prediction.tracking import detector as model_file
+from face_prediction.tracking.detector import (
+    DetectorSettings,
+    FaceDetection,
+    FaceDetector,
+    default_model_path,
+    find_model,
+)
+from face_prediction.tracking.tracks import load_track
 
 
 def picture(left: int | None) -> np.ndarray:

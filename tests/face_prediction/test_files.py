@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from face_prediction.errors import RequestError
-from face_prediction.library import build_library, load_library, save_library
-from face_prediction.motion import MotionSettings, lift
+from face_prediction.motion.library import build_library, load_library, save_library
+from face_prediction.motion.motion import MotionSettings, lift
 from face_prediction.npz_file import write_npz
-from face_prediction.tracks import load_track, save_track
+from face_prediction.tracking.tracks import load_track, save_track
 
 
 def mouth(frames: int) -> np.ndarray:

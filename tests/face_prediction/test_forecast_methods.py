@@ -10,21 +10,18 @@ from face_prediction.forecast import LandmarkSequences, mouth_centre
 from face_prediction.forecast.autoregression import (
     LandmarkAutoregression,
     MouthAutoregression,
-    principal_shapes,
-)
-from face_prediction.forecast.constant_velocity import ConstantVelocity, Line
-from face_prediction.forecast.folds import subject_folds
-from face_prediction.forecast.least_squares import (
     choose,
     forecast,
     held_out_errors,
     moments,
+    principal_shapes,
     solve,
     spectral_radius,
     stabilised,
 )
-from face_prediction.forecast.persistence import Persistence
-from face_prediction.lifting import LIPS
+from face_prediction.forecast.interface import subject_folds
+from face_prediction.forecast.simple import ConstantVelocity, Line, Persistence
+from face_prediction.tracking.lifting import LIPS
 
 FACE = np.random.default_rng(5).uniform(0.2, 0.8, (468, 2))
 AHEAD = np.arange(1, 6)[:, None, None]

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.live.history import landmarks_at, nearest, times_back
-from face_prediction.resample import Samples, resample
+from face_prediction.live.streaming import landmarks_at, nearest, times_back
+from face_prediction.tracking.extract import Samples, resample
 
 steps = st.lists(st.floats(0.002, 0.1), min_size=1, max_size=40)
 

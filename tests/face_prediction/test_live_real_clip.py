@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.live.finder import FaceFinder
-from face_prediction.live_command import LiveOptions, run_live
-from face_prediction.video import VideoReader
+from face_prediction.commands.live import LiveOptions, run_live
+from face_prediction.live.sources import FaceFinder
+from face_prediction.tracking.video import VideoReader
 
 pytestmark = [pytest.mark.shared, pytest.mark.long]
 

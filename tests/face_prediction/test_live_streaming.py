@@ -8,14 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.dataset.crop import Crop, crop_around
+from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.settings import SequenceSettings
 from face_prediction.errors import RequestError
-from face_prediction.forecast.constant_velocity import ConstantVelocity
-from face_prediction.history_pictures import dataset_picture
-from face_prediction.live.network import NetworkForecasting
-from face_prediction.live.streaming import LandmarkForecasting, LiveForecast, StreamingPredictor
-from face_prediction.predictor import Forecast, PictureNeeds
+from face_prediction.forecast.simple import ConstantVelocity
+from face_prediction.live.streaming import (
+    LandmarkForecasting,
+    LiveForecast,
+    NetworkForecasting,
+    StreamingPredictor,
+)
+from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.tracking.crop import Crop, crop_around
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 pytestmark = pytest.mark.long
@@ -221,7 +225,7 @@ class Still:
 
 
 def test_a_baseline_needs_no_picture(make_track) -> None:
-    from face_prediction.evaluation.baseline_predictor import BaselinePredictor
+    from face_prediction.evaluation.setup import BaselinePredictor
 
     predictor = BaselinePredictor(ConstantVelocity())
     stream = StreamingPredictor(LandmarkForecasting(predictor, 5), SETTINGS)

@@ -11,13 +11,22 @@ import torch
 
 from face_prediction.errors import RequestError
 from face_prediction.forecast.interface import LandmarkSequences
-from face_prediction.models.approach import sinusoids
-from face_prediction.models.attention import CrossAttention
-from face_prediction.models.encoders import ImageEncoder, LandmarkEncoder
+from face_prediction.models.approaches import (
+    CrossAttention,
+    ImageEncoder,
+    LandmarkEncoder,
+    sinusoids,
+)
 from face_prediction.models.interface import Future, History
-from face_prediction.models.presets import PRESETS, preset_settings
-from face_prediction.models.registry import MODELS, make_model, settings_class
-from face_prediction.models.settings import CrossAttentionSettings, FusionSettings
+from face_prediction.models.settings import (
+    MODELS,
+    PRESETS,
+    CrossAttentionSettings,
+    FusionSettings,
+    make_model,
+    preset_settings,
+    settings_class,
+)
 
 APPROACHES = ("image_only", "simple_fusion", "cross_attention")
 TINY = {

@@ -8,8 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from face_prediction.errors import RequestError
-from face_prediction.motion import MotionSettings, lift, smooth_depth, step_tremor
-from face_prediction.quality import QualityLimits
+from face_prediction.motion.motion import (
+    MotionSettings,
+    QualityLimits,
+    lift,
+    smooth_depth,
+    step_tremor,
+)
 
 FPS = 30.0
 SHORT = MotionSettings(min_run=1.0)  # windows of 31 frames

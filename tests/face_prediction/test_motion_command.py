@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.cli import main
-from face_prediction.library import load_library
-from face_prediction.report import BEGIN, END
-from face_prediction.tracks import save_track
+from face_prediction.commands.cli import main
+from face_prediction.motion.library import load_library
+from face_prediction.motion.report import BEGIN, END
+from face_prediction.tracking.tracks import save_track
 
 pytestmark = pytest.mark.long
 

@@ -10,21 +10,21 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction import predict_command
-from face_prediction.cli import main
-from face_prediction.cross_fit import CrossFit, Fitted
+from face_prediction.commands import predict as predict_command
+from face_prediction.commands.cli import main
+from face_prediction.commands.predict import PredictOptions, run_predict
+from face_prediction.dataset.history_images import history_pictures
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import clip_frames
 from face_prediction.errors import RequestError
+from face_prediction.evaluation.setup import CrossFit, Fitted
 from face_prediction.forecast import mouth_centre
-from face_prediction.history_pictures import history_pictures
-from face_prediction.library import load_library, save_library
-from face_prediction.lifting import LIPS
-from face_prediction.predict_command import PredictOptions, run_predict
-from face_prediction.predicted_motion import find_origins
-from face_prediction.predictor import Forecast, PictureNeeds
-from face_prediction.tracks import FaceTrack, load_track, save_track
-from face_prediction.video import sha256_of
+from face_prediction.motion.library import load_library, save_library
+from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.predicted_motion import find_origins
+from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.tracks import FaceTrack, load_track, save_track
+from face_prediction.tracking.video import sha256_of
 
 pytestmark = pytest.mark.long
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from face_prediction.cross_fit import cross_fit
+from face_prediction.commands.live import load_forecasting
+from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.manifest import ClipEntry, Manifest, write_manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.settings import SequenceSettings
 from face_prediction.errors import RequestError
-from face_prediction.history_pictures import dataset_picture
+from face_prediction.evaluation.setup import cross_fit
 from face_prediction.live.streaming import StreamingPredictor
-from face_prediction.live_command import load_forecasting
-from face_prediction.video import sha256_of
+from face_prediction.tracking.video import sha256_of
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 pytestmark = pytest.mark.long
@@ -46,7 +46,7 @@ def dataset(tmp_path: Path) -> Path:
 def trained(tmp_path: Path, dataset: Path) -> Callable[..., Path]:
     """A folder as ``train`` leaves it, of a tiny network with random weights."""
     from face_prediction.models.checkpoint import CheckpointRecord, save_checkpoint
-    from face_prediction.models.registry import make_model, settings_class
+    from face_prediction.models.settings import make_model, settings_class
 
     def save(fold: int, model: str = "cross_attention", name: str = "", **changes: Any) -> Path:
         sizes = {"size": 32, "channels": (4, 8), "width": 16, "heads": 2, "feedforward": 16}

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from face_prediction.dataset.crop import Crop, crop_around
 from face_prediction.forecast import mouth_centre
-from face_prediction.lifting import mouth_centres
-from face_prediction.predicted_motion import (
+from face_prediction.motion.motion import Quality
+from face_prediction.prediction.predicted_motion import (
     Origin,
     crop_history,
     errors_across,
@@ -17,7 +16,8 @@ from face_prediction.predicted_motion import (
     image_points,
     mouth_ahead,
 )
-from face_prediction.quality import Quality
+from face_prediction.tracking.crop import Crop, crop_around
+from face_prediction.tracking.lifting import mouth_centres
 
 SIZE = (640, 480)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from face_prediction.errors import RequestError
-from face_prediction.quality import QualityLimits, assess, stretches, tremor
+from face_prediction.motion.motion import QualityLimits, assess, stretches, tremor
 
 FPS = 30.0
 LIMITS = QualityLimits()

@@ -7,14 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.cli import main
-from face_prediction.detector import DetectorSettings, FaceDetector
-from face_prediction.face_geometry import head_pose_from_landmarks, read_canonical_face
-from face_prediction.lifting import CANONICAL_MOUTH, LIPS, mouth_centres
-from face_prediction.motion import step_tremor
-from face_prediction.rigid_pose import rigid_face
-from face_prediction.tracks import FaceTrack, load_track
-from face_prediction.video import VideoReader
+from face_prediction.commands.cli import main
+from face_prediction.motion.motion import step_tremor
+from face_prediction.tracking.detector import DetectorSettings, FaceDetector
+from face_prediction.tracking.geometry import (
+    head_pose_from_landmarks,
+    read_canonical_face,
+    rigid_face,
+)
+from face_prediction.tracking.lifting import CANONICAL_MOUTH, LIPS, mouth_centres
+from face_prediction.tracking.tracks import FaceTrack, load_track
+from face_prediction.tracking.video import VideoReader
 
 pytestmark = [pytest.mark.shared, pytest.mark.long]
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from face_prediction.resample import MAX_GAP, Samples, resample
+from face_prediction.tracking.extract import MAX_GAP, Samples, resample
 
 
 def moving(times: np.ndarray, valid: np.ndarray | None = None) -> Samples:

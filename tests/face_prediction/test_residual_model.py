@@ -9,12 +9,10 @@ from torch import Tensor
 
 from face_prediction.errors import RequestError
 from face_prediction.forecast import LandmarkSequences
-from face_prediction.lifting import LIPS
 from face_prediction.models.interface import Future, History
-from face_prediction.models.residual.model import ResidualModel
-from face_prediction.models.residual.regions import cut_out
+from face_prediction.models.residual.model import ResidualModel, cut_out, flow, warp
 from face_prediction.models.residual.settings import ResidualSettings
-from face_prediction.models.residual.warping import flow, warp
+from face_prediction.tracking.lifting import LIPS
 
 S = 32
 SETTINGS = ResidualSettings(

@@ -8,15 +8,15 @@ import torch
 from numpy.typing import NDArray
 
 from face_prediction.forecast import LandmarkSequences, mouth_centre
-from face_prediction.models.residual.experts import (
+from face_prediction.models.residual.prior import (
     BLOCKS,
+    AdaptivePrior,
     adapted,
     features,
     fit_people,
     learning_weights,
     outcomes,
 )
-from face_prediction.models.residual.prior import AdaptivePrior
 
 H = 5
 pytestmark = pytest.mark.long

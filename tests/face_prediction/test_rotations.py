@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from face_prediction.rotations import (
+from face_prediction.tracking.geometry import (
     continuous_quaternions,
     matrix_from_quaternion,
     quaternion_from_matrix,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.runs import longest_runs, permitted_starts
+from face_prediction.motion.motion import longest_runs, permitted_starts
 
 
 def slow_permitted(mouth: np.ndarray, window: int, reach: float) -> list[bool]:

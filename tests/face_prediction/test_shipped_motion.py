@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.library import MotionLibrary, load_library
-from face_prediction.report import BEGIN, END, tables
-from face_prediction.rotations import rotation_angle
+from face_prediction.motion.library import MotionLibrary, load_library
+from face_prediction.motion.report import BEGIN, END, tables
+from face_prediction.tracking.geometry import rotation_angle
 
 WINDOW = 361  # 12 s at 30 frames a second
 REACH = 0.08  # m on each axis
@@ -18,7 +18,7 @@ FACING = 35.0  # degrees
 
 @pytest.fixture(scope="module")
 def path(repository: Path) -> Path:
-    return repository / "robo_manip_baselines/envs/mujoco/assets/face_motion.npz"
+    return repository / "robo_manip_baselines/envs/mujoco/face/assets/face_motion.npz"
 
 
 @pytest.fixture(scope="module")

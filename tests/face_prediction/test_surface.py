@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
-from face_prediction import surface
+from face_prediction.commands import export_surface as surface
+from face_prediction.commands.export_surface import ExportSurfaceOptions, Topology, export_surface
 from face_prediction.errors import RequestError
-from face_prediction.surface import ExportSurfaceOptions, Topology, export_surface
-from face_prediction.surface_fit import (
+from face_prediction.motion.surface import (
     CANONICAL_MEAN,
     align,
     align_subjects,
@@ -29,10 +29,10 @@ from face_prediction.surface_fit import (
     opening_velocity,
     symmetric,
 )
-from face_prediction.tracks import FaceTrack, save_track
+from face_prediction.tracking.tracks import FaceTrack, save_track
 
 ROOT = Path(__file__).resolve().parents[2]
-SHIPPED = ROOT / "robo_manip_baselines/envs/mujoco/assets/face_surface.npz"
+SHIPPED = ROOT / "robo_manip_baselines/envs/mujoco/face/assets/face_surface.npz"
 GROUPS = ("lips_outer", "lips_inner", "eye_left", "eye_right", "eyebrow_left", "eyebrow_right")
 SIZE = (640, 480)
 

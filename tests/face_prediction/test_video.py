@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from face_prediction.errors import RequestError
-from face_prediction.video import VideoReader, require_video, sha256_of
+from face_prediction.tracking.video import VideoReader, require_video, sha256_of
 
 pytestmark = pytest.mark.long
 

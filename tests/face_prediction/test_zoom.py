@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from face_prediction.detector import FaceDetection
 from face_prediction.errors import RequestError
-from face_prediction.extract import FaceFollower
-from face_prediction.face_geometry import (
-    CanonicalFace,
-    head_pose_from_landmarks,
-    read_canonical_face,
-)
-from face_prediction.rigid_pose import rigid_face, rigid_head_poses
-from face_prediction.zoom import (
+from face_prediction.tracking.detector import FaceDetection
+from face_prediction.tracking.extract import (
+    FaceFollower,
     Window,
     ZoomingDetector,
     face_box,
     search_windows,
     whole_image_detection,
     window_around,
+)
+from face_prediction.tracking.geometry import (
+    CanonicalFace,
+    head_pose_from_landmarks,
+    read_canonical_face,
+    rigid_face,
+    rigid_head_poses,
 )
 
 

@@ -13,19 +13,19 @@ import pytest
 
 from robo_manip_baselines.data import EpisodeReader
 from robo_manip_baselines.data.demonstrations import load_demonstrations
-from robo_manip_baselines.envs.mujoco.face_env import world_of
-from robo_manip_baselines.envs.mujoco.motion import (
+from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
+from robo_manip_baselines.envs.mujoco.face.motion import (
     DEFAULT_LIBRARY,
     WORLD_FROM_CAMERA,
     MotionLibrary,
 )
-from robo_manip_baselines.envs.mujoco.registration import make_env
-from robo_manip_baselines.envs.mujoco.scene import MOUTH_BASE
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.task import Task
-from robo_manip_baselines.expert.collect import Collection, collect
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 from robo_manip_baselines.observation import Corruption, ObservationSpec
-from robo_manip_baselines.observation.vector import vector_names
+from robo_manip_baselines.observation.state import vector_names
+from robo_manip_baselines.rollout.demonstrate import Collection, collect
+from robo_manip_baselines.rollout.workers import Task
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

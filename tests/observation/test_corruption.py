@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import ERRORS, MEASURED_ERRORS
-from robo_manip_baselines.observation.error import DRAWN_ERRORS
+from robo_manip_baselines.observation.error_models import DRAWN_ERRORS
 from robo_manip_baselines.observation.error_stats import load_error_stats
-from robo_manip_baselines.observation.options import CorruptionOptions
+from robo_manip_baselines.observation.spec import CorruptionOptions
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @pytest.mark.parametrize(

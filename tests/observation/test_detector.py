@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import Corruption, ObservationSpec, Report, Truth, observe
 from robo_manip_baselines.observation.detector import Detector
 from robo_manip_baselines.observation.error_stats import load_error_stats
+from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import PERIOD, made_up_stats, step_of, wandering_truth, write_stats
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.observation.error import (
+from robo_manip_baselines.observation.error_models import (
     BLOCK_FRAMES,
     DRAWN_ERRORS,
     WORLD_FROM_IMAGE,
 )
 from robo_manip_baselines.observation.error_stats import ErrorStats, load_error_stats
+from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import made_up_stats, write_stats
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
+from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import made_up_stats, write_stats
 

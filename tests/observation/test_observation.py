@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec, Truth, observe
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def truth(shape: tuple[int, ...], arms: int, seed: int = 0) -> Truth:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
+from robo_manip_baselines.data.demonstrations import recorded_truth
 from robo_manip_baselines.data.example import make_arrays, make_attributes
-from robo_manip_baselines.evaluation.episode_replay import remake_env
-from robo_manip_baselines.expert.collect import Collection, collect
 from robo_manip_baselines.observation import ObservationSpec, observe
-from robo_manip_baselines.observation.recorded import recorded_truth
+from robo_manip_baselines.rollout.demonstrate import Collection, collect
+from robo_manip_baselines.rollout.replay import remake_env
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robo_manip_baselines.observation import Corruption
-from robo_manip_baselines.observation.schedule import Schedule, draw_lost, frame_of
+from robo_manip_baselines.observation.detector import Schedule, draw_lost, frame_of
 
 FRAMES = 40
 STEP = 0.02

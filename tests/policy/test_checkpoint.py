@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 import torch
 
+from robo_manip_baselines.data.demonstrations import Split
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.data.split import Split
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.checkpoint import (
@@ -27,12 +26,11 @@ from robo_manip_baselines.policy.checkpoint import (
     without_initial_weights,
     write_checkpoint,
 )
-from robo_manip_baselines.policy.checkpoint_files import step_folder, whole_folder
 from robo_manip_baselines.policy.mlp.config import MlpConfig
-from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
 from robo_manip_baselines.policy.registry import make_model
-from robo_manip_baselines.policy.sizes import Sizes
-from robo_manip_baselines.training.settings import TrainSettings
+from robo_manip_baselines.runs.checkpoints import step_folder, whole_folder
+from robo_manip_baselines.runs.errors import RequestError
 
 FILES = ("model.safetensors", "config.json", "stats.json", "trainer.safetensors", "trainer.json")
 

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.vector import to_vector, vector_names
-from robo_manip_baselines.policy.chunk_policy import ChunkPolicy
+from robo_manip_baselines.observation.state import to_vector, vector_names
+from robo_manip_baselines.policy.execution import ChunkPolicy
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.runs.errors import RequestError
 
 SPEC = ObservationSpec(obs="current", cameras=("angle", "top"), image_size=(6, 8))
 SIZE = len(vector_names(SPEC))

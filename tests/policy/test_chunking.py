@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.chunking import (
+from robo_manip_baselines.policy.execution import (
     Chunking,
     ExecuteFirst,
     TemporalEnsemble,
     make_chunking,
 )
 from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.runs.errors import RequestError
 
 ACTION_SIZE = 2
 

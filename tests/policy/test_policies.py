@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
-from robo_manip_baselines.policy.presets import PolicyPreset
+from robo_manip_baselines.policy.presets import PolicyPreset, Sizes
 from robo_manip_baselines.policy.registry import POLICIES, load_part, make_model
-from robo_manip_baselines.policy.sizes import Sizes
 
 SIZES = Sizes(state=29, action=7, cameras=0, image=(480, 640))
 CHUNK = 6

@@ -13,8 +13,8 @@ from typing import Annotated, Literal
 import pytest
 import tyro
 
-from robo_manip_baselines.command import parse, run_command
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,8 @@ def test_subcommands() -> None:
 def run(body: str) -> subprocess.CompletedProcess[str]:
     code = (
         "import logging, os, sys, time\n"
-        "from robo_manip_baselines.command import run_command\n"
-        "from robo_manip_baselines.errors import RequestError\n"
+        "from robo_manip_baselines.runs.command import run_command\n"
+        "from robo_manip_baselines.runs.errors import RequestError\n"
         f"def main():\n    {body}\n"
         "run_command(main)\n"
     )
@@ -159,7 +159,7 @@ def test_other_failures_keep_their_traceback() -> None:
 
 def test_signal_from_the_terminal() -> None:
     code = (
-        "import time\nfrom robo_manip_baselines.command import run_command\n"
+        "import time\nfrom robo_manip_baselines.runs.command import run_command\n"
         "def main():\n    print('ready', flush=True)\n    time.sleep(60)\nrun_command(main)\n"
     )
     command = [sys.executable, "-c", code]
@@ -176,7 +176,7 @@ def test_signal_from_the_terminal() -> None:
 @pytest.mark.parametrize("lines", [1, 100_000])
 def test_reader_that_leaves_is_no_traceback(lines: int) -> None:
     code = (
-        "import time\nfrom robo_manip_baselines.command import run_command\n"
+        "import time\nfrom robo_manip_baselines.runs.command import run_command\n"
         f"def main():\n    time.sleep(0.2)\n    for i in range({lines}):\n        print(i)\n"
         "run_command(main)\n"
     )

@@ -22,7 +22,7 @@ OF_TORCH = (
     "face_prediction.models",
     "face_prediction.training",
     "robo_manip_baselines.policy.act",
-    "robo_manip_baselines.policy.chunk_policy",
+    "robo_manip_baselines.policy.execution",
     "robo_manip_baselines.policy.interface",
     "robo_manip_baselines.policy.mlp",
     "robo_manip_baselines.training",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.expert.feeding import EXPERTS
+from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS
 from robo_manip_baselines.observation import PRESETS
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)

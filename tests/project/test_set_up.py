@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from robo_manip_baselines import opengl_check
+from robo_manip_baselines.envs.mujoco.cell import opengl as opengl_check
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.training.chunks import take_chunks
+from robo_manip_baselines.training.sampling import take_chunks
 
 
 def slow_chunk(

@@ -11,15 +11,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.commands import train as train_command
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.interrupt import StopRequest
+from robo_manip_baselines.runs.metrics import write_curves
+from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training import device as device_module
-from robo_manip_baselines.training import train_command
-from robo_manip_baselines.training.device import autocast_type, choose_device, prepare_device
-from robo_manip_baselines.training.distributed import Processes
-from robo_manip_baselines.training.interrupt import StopRequest
-from robo_manip_baselines.training.phases import PHASES, PhaseClock
-from robo_manip_baselines.training.plots import write_curves
-from robo_manip_baselines.training.seeds import derive_seed
+from robo_manip_baselines.training.device import (
+    Processes,
+    autocast_type,
+    choose_device,
+    prepare_device,
+)
+from robo_manip_baselines.training.timing import PHASES, PhaseClock
 
 CPU = torch.device("cpu")
 CUDA = torch.device("cuda", 0)

@@ -18,13 +18,12 @@ from robo_manip_baselines.data import episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.interface import Batch
-from robo_manip_baselines.training.frames import FrameSource
-from robo_manip_baselines.training.loader import BatchLoader, part_of
-from robo_manip_baselines.training.schedule import Schedule
-from robo_manip_baselines.training.state_noise import StateNoise
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.training.batching import BatchLoader, part_of
+from robo_manip_baselines.training.images import FrameSource
+from robo_manip_baselines.training.sampling import Schedule, StateNoise
 
 LENGTHS = (6, 9, 4, 7, 5)
 TRAIN = (3, 0, 4)  # not in order: the schedule's episodes are places in this list

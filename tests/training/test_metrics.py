@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.training.metrics import (
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.metrics import (
     MetricsLog,
     RunningMean,
     open_board,

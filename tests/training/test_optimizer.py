@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
-from robo_manip_baselines.policy.sizes import Sizes
-from robo_manip_baselines.training.optimizer import (
+from robo_manip_baselines.policy.presets import Sizes, TrainSettings
+from robo_manip_baselines.training.step import (
     WeightAverage,
     learning_rate_factor,
     make_optimizer,
     set_learning_rate,
 )
-from robo_manip_baselines.training.settings import TrainSettings
 
 SIZES = Sizes(state=3, action=2, cameras=0, image=(1, 1))
 

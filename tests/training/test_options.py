@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.act.config import ActConfig
-from robo_manip_baselines.policy.act.presets import PRESETS
+from robo_manip_baselines.policy.act.config import PRESETS, ActConfig
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.options import FREE, TrainOptions, parse_options
 from robo_manip_baselines.training.run_folder import require_same_config
 

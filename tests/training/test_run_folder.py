@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.checkpoint_files import list_checkpoints, step_folder
+from robo_manip_baselines.runs.checkpoints import list_checkpoints, step_folder
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.run_folder import (
     locked,
     prune,

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.training.schedule import Schedule
-from robo_manip_baselines.training.settings import TrainSettings
+from robo_manip_baselines.policy.presets import TrainSettings
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.training.sampling import Schedule
 
 LENGTHS = st.lists(st.integers(1, 9), min_size=1, max_size=8)
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.vector import vector_names
-from robo_manip_baselines.training.state_noise import StateNoise, noise_of
+from robo_manip_baselines.observation.state import vector_names
+from robo_manip_baselines.training.sampling import StateNoise, noise_of
 
 SPEC = ObservationSpec(obs="current_pred", horizon=3, cameras=(), object_pose=True)
 

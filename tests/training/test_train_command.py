@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.commands.train import train
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
-from robo_manip_baselines.policy.checkpoint_files import list_checkpoints
-from robo_manip_baselines.training.metrics import read_metrics
+from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.metrics import read_metrics
 from robo_manip_baselines.training.requirements import prepare_pytorch
-from robo_manip_baselines.training.train_command import train
 
 pytestmark = pytest.mark.long
 

@@ -13,17 +13,16 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.act import backbone
+from robo_manip_baselines.policy.act import resnet as backbone
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
-from robo_manip_baselines.policy.checkpoint_files import list_checkpoints
-from robo_manip_baselines.training.distributed import Processes
-from robo_manip_baselines.training.job import Job
-from robo_manip_baselines.training.metrics import MetricsLog, read_metrics
+from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics
+from robo_manip_baselines.training.device import Processes
 from robo_manip_baselines.training.options import parse_options
-from robo_manip_baselines.training.parts import Parts, assembled
 from robo_manip_baselines.training.run_folder import METRICS
-from robo_manip_baselines.training.trainer import Outcome, Trainer
+from robo_manip_baselines.training.setup import Job
+from robo_manip_baselines.training.trainer import Outcome, Parts, Trainer, assembled
 
 pytestmark = pytest.mark.long
 
@@ -55,7 +54,7 @@ RUNS = {
 @pytest.fixture(autouse=True)
 def narrow_backbone(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ResNet-18 of a thousandth of the size."""
-    monkeypatch.setattr(backbone, "WIDTHS", (4, 4, 8, 8))
+    monkeypatch.setattr(backbone, "WIDTHS", (8, 8, 8, 8))
 
 
 def run(line: str, episodes: Path, out: Path, stop_at: int | None = None) -> Outcome:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.policy.presets import WITHOUT_IMAGES, Acting, PolicyPreset
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import itertools
 
 from torch import Tensor, nn
 
-from robo_manip_baselines.errors import RequestError
 from robo_manip_baselines.policy.interface import Batch, PolicyModel, Sizes, masked_mean
 from robo_manip_baselines.policy.mlp.config import MlpConfig
+from robo_manip_baselines.runs.errors import RequestError
 
 
 class MlpModel(PolicyModel):

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robo_manip_baselines.evaluation.failure import failure_kind
-from robo_manip_baselines.evaluation.result import EpisodeResult
-from robo_manip_baselines.evaluation.statistics.lines import Line, read_lines
-from robo_manip_baselines.evaluation.statistics.study import Study, analyse
+from robo_manip_baselines.benchmark.statistics.outcomes import Line, read_lines
+from robo_manip_baselines.benchmark.statistics.study import Study, analyse
+from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import failure_kind
+from robo_manip_baselines.rollout.results import EpisodeResult
 
 ARMS = {
     "baseline": 0.42,

@@ -6,8 +6,7 @@ import random
 
 import pytest
 
-from robo_manip_baselines.evaluation.paper_results import PAPER, TRIALS
-from robo_manip_baselines.evaluation.statistics.arms import (
+from robo_manip_baselines.benchmark.statistics.conditions import (
     BASELINE,
     CURRENT,
     FURTHER,
@@ -16,6 +15,7 @@ from robo_manip_baselines.evaluation.statistics.arms import (
     arm_of,
     in_order,
 )
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER, TRIALS
 
 
 @pytest.mark.parametrize(

@@ -10,16 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.evaluation.benchmark_plots import (
+from robo_manip_baselines.benchmark.report.figures import INK, Plot, write_plots
+from robo_manip_baselines.benchmark.report.plots import (
     arrivals,
     benchmark_plots,
     completion_times,
+    delay_surface,
     failure_kinds,
+    success_by_horizon,
 )
-from robo_manip_baselines.evaluation.figures import INK, Plot, write_plots
-from robo_manip_baselines.evaluation.horizon_plots import delay_surface, success_by_horizon
-from robo_manip_baselines.evaluation.statistics.lines import Line
-from robo_manip_baselines.evaluation.statistics.study import Study, analyse
+from robo_manip_baselines.benchmark.statistics.outcomes import Line
+from robo_manip_baselines.benchmark.statistics.study import Study, analyse
 
 pytestmark = pytest.mark.long
 
@@ -115,7 +116,7 @@ def test_files_have_a_white_ground(tmp_path: Path, plots: dict[str, Plot]) -> No
 def test_many_episodes_become_pixels(
     monkeypatch: pytest.MonkeyPatch, study: Study, plots: dict[str, Plot]
 ) -> None:
-    monkeypatch.setattr("robo_manip_baselines.evaluation.benchmark_plots.MANY_POINTS", 10)
+    monkeypatch.setattr("robo_manip_baselines.benchmark.report.plots.MANY_POINTS", 10)
     one = replace(study, arms=study.arms[:1])
     for draw in (arrivals, completion_times):
         assert "data:image/png;base64" in draw(one).svg

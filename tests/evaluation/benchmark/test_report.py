@@ -16,23 +16,22 @@ import cv2
 import numpy as np
 import pytest
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.report.clips import (
+from robo_manip_baselines.benchmark.report.page import (
     EpisodeVideo,
+    ReportData,
     episodes_to_show,
-    read_video,
-)
-from robo_manip_baselines.evaluation.report.data import ReportData, report_data
-from robo_manip_baselines.evaluation.report.render import (
     link,
+    read_video,
     render_report,
+    report_data,
     study_facts,
     write_report,
 )
-from robo_manip_baselines.evaluation.statistics.arms import FURTHER, Arm
-from robo_manip_baselines.evaluation.statistics.lines import Line, Selection
-from robo_manip_baselines.evaluation.statistics.study import Study, analyse
-from robo_manip_baselines.evaluation.video import VideoWriter
+from robo_manip_baselines.benchmark.statistics.conditions import FURTHER, Arm
+from robo_manip_baselines.benchmark.statistics.outcomes import Line, Selection
+from robo_manip_baselines.benchmark.statistics.study import Study, analyse
+from robo_manip_baselines.rollout.videos import VideoWriter
+from robo_manip_baselines.runs.errors import RequestError
 
 MakeLines = Callable[..., tuple[Line, ...]]
 

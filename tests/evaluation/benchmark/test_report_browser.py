@@ -16,13 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robo_manip_baselines.evaluation.report.clips import episodes_to_show, read_video
-from robo_manip_baselines.evaluation.report.data import report_data
-from robo_manip_baselines.evaluation.report.render import link, write_report
-from robo_manip_baselines.evaluation.statistics.lines import Line
-from robo_manip_baselines.evaluation.statistics.study import Study, analyse
-from robo_manip_baselines.evaluation.study_tables import study_tables
-from robo_manip_baselines.evaluation.video import VideoWriter
+from robo_manip_baselines.benchmark.report.page import (
+    episodes_to_show,
+    link,
+    read_video,
+    report_data,
+    write_report,
+)
+from robo_manip_baselines.benchmark.statistics.outcomes import Line
+from robo_manip_baselines.benchmark.statistics.study import Study, analyse
+from robo_manip_baselines.benchmark.tables.study import study_tables
+from robo_manip_baselines.rollout.videos import VideoWriter
 
 pytestmark = pytest.mark.long
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.evaluation.benchmark_plots import benchmark_plots
-from robo_manip_baselines.evaluation.statistics.lines import Line
-from robo_manip_baselines.evaluation.statistics.study import Study, analyse
-from robo_manip_baselines.evaluation.study_tables import study_tables
+from robo_manip_baselines.benchmark.report.plots import benchmark_plots
+from robo_manip_baselines.benchmark.statistics.outcomes import Line
+from robo_manip_baselines.benchmark.statistics.study import Study, analyse
+from robo_manip_baselines.benchmark.tables.study import study_tables
 
 pytestmark = pytest.mark.long
 

@@ -10,15 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robo_manip_baselines.evaluation.paper_results import PAPER, TRIALS, PaperResult
-from robo_manip_baselines.evaluation.statistics.comparison import (
+from robo_manip_baselines.benchmark.statistics.comparison import (
     against_paper,
     holm,
     paired_success,
     paired_times,
     time_against_paper,
 )
-from robo_manip_baselines.evaluation.statistics.intervals import (
+from robo_manip_baselines.benchmark.statistics.intervals import (
     Estimate,
     bootstrap_mean,
     hierarchical_mean,
@@ -26,7 +25,8 @@ from robo_manip_baselines.evaluation.statistics.intervals import (
     mean_estimate,
     rate_estimate,
 )
-from robo_manip_baselines.evaluation.summary import share
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER, TRIALS, PaperResult
+from robo_manip_baselines.rollout.results import share
 
 NAN = np.nan
 

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robo_manip_baselines.benchmark.arm_file import ARMS, read_arms
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.evaluation.paper_results import PAPER
-from robo_manip_baselines.evaluation.statistics.arms import FURTHER, Arm
-from robo_manip_baselines.evaluation.statistics.comparison import holm
-from robo_manip_baselines.evaluation.statistics.findings import (
+from robo_manip_baselines.benchmark.conditions import ARMS, read_arms
+from robo_manip_baselines.benchmark.statistics.comparison import holm
+from robo_manip_baselines.benchmark.statistics.conditions import FURTHER, Arm
+from robo_manip_baselines.benchmark.statistics.findings import (
     CLAIMS,
     FURTHER_CLAIMS,
     LITTLE,
@@ -22,10 +20,16 @@ from robo_manip_baselines.evaluation.statistics.findings import (
     Finding,
     findings,
 )
-from robo_manip_baselines.evaluation.statistics.intervals import Estimate
-from robo_manip_baselines.evaluation.statistics.lines import Line, read_lines
-from robo_manip_baselines.evaluation.statistics.outcomes import on_common_seeds, outcomes_of
-from robo_manip_baselines.evaluation.statistics.study import Study, analyse
+from robo_manip_baselines.benchmark.statistics.intervals import Estimate
+from robo_manip_baselines.benchmark.statistics.outcomes import (
+    Line,
+    on_common_seeds,
+    outcomes_of,
+    read_lines,
+)
+from robo_manip_baselines.benchmark.statistics.study import Study, analyse
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

@@ -11,14 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.evaluation.cells import later, p_cell, percent, points, seconds
-from robo_manip_baselines.evaluation.failure import FAILURES
-from robo_manip_baselines.evaluation.paper_results import PAPER
-from robo_manip_baselines.evaluation.statistics.findings import findings
-from robo_manip_baselines.evaluation.statistics.lines import Line, Selection
-from robo_manip_baselines.evaluation.statistics.study import Study, analyse
-from robo_manip_baselines.evaluation.study_tables import study_tables
-from robo_manip_baselines.evaluation.tables import (
+from robo_manip_baselines.benchmark.statistics.findings import findings
+from robo_manip_baselines.benchmark.statistics.outcomes import Line, Selection
+from robo_manip_baselines.benchmark.statistics.study import Study, analyse
+from robo_manip_baselines.benchmark.tables.study import (
+    later,
+    p_cell,
+    percent,
+    points,
+    seconds,
+    study_tables,
+)
+from robo_manip_baselines.benchmark.tables.table import (
     Cell,
     Column,
     Row,
@@ -28,6 +32,8 @@ from robo_manip_baselines.evaluation.tables import (
     to_markdown,
     write_tables,
 )
+from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import FAILURES
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER
 
 SMALL = Table(
     "small",

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.cli import main
-from face_prediction.lifting import LIPS
-from face_prediction.tracks import FaceTrack, save_track
-from face_prediction.video import sha256_of
+from face_prediction.commands.cli import main
+from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.tracks import FaceTrack, save_track
+from face_prediction.tracking.video import sha256_of
 
 SIZE = (320, 240)
 TABLE = """clip,subject,ship,licence,source,what

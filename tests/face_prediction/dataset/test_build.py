@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.cli import main
+from face_prediction.commands.cli import main
 from face_prediction.dataset.build import cut_pictures
 from face_prediction.dataset.manifest import read_manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import clip_frames, find_sequences
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.lifting import LIPS
-from face_prediction.tracks import save_track
-from face_prediction.video import VideoReader, sha256_of
+from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.tracks import save_track
+from face_prediction.tracking.video import VideoReader, sha256_of
 
 pytestmark = pytest.mark.long
 

@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-import face_prediction.evaluate_command as command
-from face_prediction.cli import main
+import face_prediction.commands.evaluate as command
+from face_prediction.commands.cli import main
+from face_prediction.commands.evaluate import EvaluateOptions, run_evaluate
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.detector import FaceDetection
-from face_prediction.evaluate_command import EvaluateOptions, run_evaluate
-from face_prediction.evaluation.provenance import Checkpoint
-from face_prediction.forecast.mouth import mouth_centre
-from face_prediction.lifting import LIPS
-from face_prediction.predictor import Forecast, PictureNeeds
-from face_prediction.tracks import FaceTrack, save_track
-from face_prediction.video import sha256_of
+from face_prediction.evaluation.setup import Checkpoint
+from face_prediction.forecast.interface import mouth_centre
+from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.tracking.detector import FaceDetection
+from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.tracks import FaceTrack, save_track
+from face_prediction.tracking.video import sha256_of
 
 SIZE = (320, 240)
 TABLE = """clip,subject,ship,licence,source,what

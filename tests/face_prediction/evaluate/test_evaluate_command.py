@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import tyro
 
+from face_prediction.commands.evaluate import EvaluateOptions
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.evaluate_command import EvaluateOptions
-from face_prediction.forecast.mouth import mouth_centre
+from face_prediction.forecast.interface import mouth_centre
 
 from .conftest import rows_of, run
 

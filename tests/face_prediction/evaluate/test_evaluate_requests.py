@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-import face_prediction.evaluate_command as command
-from face_prediction.cli import main
+import face_prediction.commands.evaluate as command
+from face_prediction.commands.cli import main
 from face_prediction.errors import RequestError
-from face_prediction.evaluation.provenance import load_checkpoint
+from face_prediction.evaluation.setup import load_checkpoint
 
 from .conftest import run
 

@@ -12,9 +12,8 @@ import pytest
 
 from face_prediction.dataset.clip_file import open_clip, read_array
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.evaluation.clip_story import clip_story
-from face_prediction.evaluation.clip_video import FORECASTS, PAUSE, draw_story
-from face_prediction.forecast.mouth import mouth_centre
+from face_prediction.evaluation.video import FORECASTS, PAUSE, clip_story, draw_story
+from face_prediction.forecast.interface import mouth_centre
 
 from .conftest import SIZE, red_dots, run
 

@@ -13,7 +13,7 @@ from face_prediction.errors import RequestError
 from face_prediction.live import sinks, sources
 from face_prediction.live.sinks import VideoFile, Window
 from face_prediction.live.sources import camera_frames, video_frames
-from face_prediction.video import VideoFrame, VideoReader
+from face_prediction.tracking.video import VideoFrame, VideoReader
 
 pytestmark = pytest.mark.long
 

@@ -9,15 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.dataset.clip_file import EncodedPictures, write_clip
-from face_prediction.dataset.facts import sequence_facts
-from face_prediction.dataset.manifest import ClipEntry, Manifest, write_manifest
-from face_prediction.dataset.pictures import encode_picture
+from face_prediction.commands.train import TrainOptions, run_train
+from face_prediction.dataset.clip_file import EncodedPictures, encode_picture, write_clip
+from face_prediction.dataset.manifest import ClipEntry, Manifest, sequence_facts, write_manifest
 from face_prediction.dataset.sequences import clip_frames, find_sequences
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.lifting import LIPS
-from face_prediction.train_command import TrainOptions, run_train
-from face_prediction.training import job
+from face_prediction.tracking.lifting import LIPS
+from face_prediction.training import setup as job
 
 SEQUENCES = SequenceSettings(history=8, future=2, stride=4, crop_size=64)
 PEOPLE = {"ann": 0, "bob": 0, "cat": 1, "dan": 2, "eve": 2}

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from face_prediction.face_geometry import read_canonical_face
 from face_prediction.models.interface import Future, History
-from face_prediction.rigid_pose import rigid_face
-from face_prediction.training import augmentation
-from face_prediction.training.augmentation import (
+from face_prediction.tracking.geometry import read_canonical_face, rigid_face
+from face_prediction.training import windows as augmentation
+from face_prediction.training.windows import (
     MIDLINE,
+    Batch,
     augment,
     mirror_indices,
     mirrored_landmarks,
@@ -21,7 +21,6 @@ from face_prediction.training.augmentation import (
     moved_pictures,
     relit,
 )
-from face_prediction.training.windows import Batch
 
 
 class TestMirror:

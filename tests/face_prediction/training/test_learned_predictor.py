@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+from face_prediction.commands.train import run_train
 from face_prediction.errors import RequestError
+from face_prediction.models.checkpoint import read_tensors, write_tensors
 from face_prediction.models.interface import History
 from face_prediction.models.learned import LearnedPredictor
-from face_prediction.models.tensor_file import read_tensors, write_tensors
-from face_prediction.train_command import run_train
 
 pytestmark = pytest.mark.long
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from face_prediction.models.tensor_file import read_tensors
-from face_prediction.train_command import TrainOptions, run_train
+from face_prediction.commands.train import TrainOptions, run_train
+from face_prediction.models.checkpoint import read_tensors
 from face_prediction.training import trainer as trainer_module
 from face_prediction.training.metrics import read_metrics
 from face_prediction.training.step import TrainStep
@@ -86,7 +86,7 @@ SCRIPT = """
 import json, logging, sys
 from pathlib import Path
 logging.basicConfig(level=logging.INFO)
-from face_prediction.train_command import TrainOptions, run_train
+from face_prediction.commands.train import TrainOptions, run_train
 given = json.loads(sys.argv[1])
 given |= {name: Path(given[name]) for name in ("dataset", "out")}
 sys.exit(run_train(TrainOptions(**given)))

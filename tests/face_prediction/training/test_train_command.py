@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 import torch
 
+from face_prediction.commands.train import TrainOptions, run_train
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.errors import RequestError
 from face_prediction.evaluation import mouth_distances, mouth_residuals
-from face_prediction.lifting import LIPS
-from face_prediction.models.checkpoint import read_checkpoint
+from face_prediction.models.checkpoint import read_checkpoint, read_tensors
 from face_prediction.models.learned import LearnedPredictor
-from face_prediction.models.tensor_file import read_tensors
-from face_prediction.train_command import TrainOptions, run_train
+from face_prediction.tracking.lifting import LIPS
 from face_prediction.training.metrics import read_metrics
-from face_prediction.training.run_folder import locked
+from face_prediction.training.setup import locked
 from face_prediction.training.step import TrainStep
 
 pytestmark = pytest.mark.long
@@ -126,7 +125,7 @@ def test_a_finished_run_whose_network_is_damaged_writes_it_again(options, held: 
 
 def test_without_torch_it_says_what_to_install(options, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "face_prediction.training.job")
+    monkeypatch.delitem(sys.modules, "face_prediction.training.setup")
     with pytest.raises(RequestError, match="pip install"):
         run_train(options)
 

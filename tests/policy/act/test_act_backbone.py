@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from robo_manip_baselines.policy.act.backbone import (
+from robo_manip_baselines.policy.act.resnet import (
     MEAN,
     STD,
     FrozenBatchNorm,

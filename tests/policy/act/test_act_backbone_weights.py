@@ -9,9 +9,8 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.act.backbone import ResNet18
-from robo_manip_baselines.policy.act.backbone_weights import load_backbone
+from robo_manip_baselines.policy.act.resnet import ResNet18, load_backbone
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long  # files of 45 MB
 

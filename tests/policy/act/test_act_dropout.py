@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from robo_manip_baselines.policy.act.dropout import Dropout
+from robo_manip_baselines.policy.act.model import Dropout
 
 COUNT = 1_000_003  # no multiple of 4
 

@@ -14,11 +14,11 @@ import torch
 from safetensors.torch import save_file
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from robo_manip_baselines.errors import RequestError
-from robo_manip_baselines.policy.act.backbone import ResNet18
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
+from robo_manip_baselines.policy.act.resnet import ResNet18
 from robo_manip_baselines.policy.interface import Batch, Sizes
+from robo_manip_baselines.runs.errors import RequestError
 
 BLIND = Sizes(state=5, action=3, cameras=0, image=(40, 70))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from robo_manip_baselines.policy.act.positions import sine_positions, sine_positions_2d
+from robo_manip_baselines.policy.act.model import sine_positions, sine_positions_2d
 
 ROUNDING = 1e-6  # fp32 of numbers up to 1
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from robo_manip_baselines.observation import CAMERAS
-from robo_manip_baselines.policy.act.presets import PRESETS
-from robo_manip_baselines.training.schedule import Schedule
+from robo_manip_baselines.policy.act.config import PRESETS
+from robo_manip_baselines.training.sampling import Schedule
 
 
 def test_paper_is_table_3() -> None:

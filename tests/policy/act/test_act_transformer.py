@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from robo_manip_baselines.policy.act.config import ActConfig
-from robo_manip_baselines.policy.act.transformer import (
+from robo_manip_baselines.policy.act.model import (
     Attention,
     Decoder,
     DecoderLayer,

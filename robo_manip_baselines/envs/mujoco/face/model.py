@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robo_manip_baselines.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 Floats = NDArray[np.float64]
 Poses = dict[str, tuple[Floats, Floats]]
 
-SURFACE = Path(__file__).parents[1] / "assets" / "face_surface.npz"
+SURFACE = Path(__file__).with_name("assets") / "face_surface.npz"
 SCHEMA, VERSION = "face_surface", 1
 
 REST_OPENING = 0.030

@@ -1,0 +1,30 @@
+"""``face-prediction train``: a dataset in, the folder of a trained network out."""
+
+from __future__ import annotations
+
+from face_prediction.errors import RequestError
+from face_prediction.training.options import TrainOptions
+
+
+def run_train(options: TrainOptions) -> int:
+    """Train a network, or carry on where training was stopped.
+
+    Returns:
+        0, or 130 when it was asked to stop (its state is saved).
+
+    Raises:
+        RequestError: the dataset, the options or the folder cannot be used, or PyTorch is not
+            installed.
+    """
+    try:
+        from face_prediction.training.setup import train  # not at the top: loads torch
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise RequestError(
+            "training needs PyTorch; pip install 'robo_manip_baselines[face-prediction]'"
+        ) from None
+    return train(options)
+
+
+__all__ = ["TrainOptions", "run_train"]

@@ -1,0 +1,109 @@
+"""The subcommands of ``bin/Dataset.py``: each is its options and a function to text."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from robo_manip_baselines.data.episode import read_metadata
+from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes
+from robo_manip_baselines.data.verify import damage_summary, verify_dataset
+from robo_manip_baselines.runs.errors import RequestError
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Find damaged, mixed-up and misplaced episode files. Ends with 1 if there are any."""
+
+    folder: Annotated[Path, tyro.conf.arg(metavar="DIR"), tyro.conf.Positional]
+    """Folder of episode_*.hdf5 files, as Rollout.py writes it."""
+    images: bool = True
+    """Decode every image, too; --no_images checks the rest only, which is much faster."""
+
+    def run(self) -> tuple[str, int]:
+        """The text to print and the exit code."""
+        problems = verify_dataset(self.folder, images=self.images)
+        lines = [*map(str, problems), damage_summary(self.folder, problems)]
+        return "\n".join(lines), int(any(not problem.is_warning for problem in problems))
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a folder of episodes holds."""
+
+    folder: Annotated[Path, tyro.conf.arg(metavar="DIR"), tyro.conf.Positional]
+    """Folder of episode_*.hdf5 files, as Rollout.py writes it."""
+
+    def run(self) -> tuple[str, int]:
+        """The text to print and the exit code."""
+        rows = dataset_info(self.folder)
+        width = max(map(len, rows))
+        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items()), 0
+
+
+Command = (
+    Annotated[Verify, tyro.conf.subcommand("verify")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+)
+
+
+def dataset_info(folder: Path) -> dict[str, str]:
+    """What a folder of episodes holds, as rows of a table: name -> text.
+
+    Raises:
+        RequestError: if there is no such folder or no episode in it.
+        EpisodeFileError: if a file is damaged.
+    """
+    paths = list_episodes(folder)
+    failed_folder = folder / FAILED_FOLDER
+    failed = list_episodes(failed_folder) if failed_folder.is_dir() else []
+    if not paths + failed:
+        raise RequestError(f"'{folder}' holds no episode_*.hdf5 file")
+    metadata = [read_metadata(path) for path in paths + failed]
+    size = sum(path.stat().st_size for path in paths + failed)
+    successes = sum(item["is_success"] for item in metadata)
+    strict = sum(item["is_success_strict"] for item in metadata)
+    durations = [item["num_steps"] * item["control_period"] for item in metadata]
+    times = [item["completion_time"] for item in metadata if item["is_success"]]
+    subjects = {item["motion_subject"] for item in metadata}
+    clips = {item["motion_clip"] for item in metadata}
+    return {
+        "folder": str(folder),
+        "demonstrations": str(len(paths)),
+        "kept apart": f"{len(failed)} in {FAILED_FOLDER}/",
+        "environment": _counted(item["env_id"] for item in metadata),
+        "expert": _counted(item["expert"] for item in metadata),
+        "success": f"{successes} of {len(metadata)} tried, {strict} by the strict condition",
+        "duration": f"{_spread(durations)} s, {sum(durations):.1f} s in all",
+        "completion time": f"{_spread(times)} s" if times else "–",
+        "people": f"{len(subjects)}, in {len(clips)} clips",
+        "cameras": _counted(_image_text(item) for item in metadata),
+        "size": f"{size / 1e6:.1f} MB, {size / len(metadata) / 1e6:.2f} MB an episode",
+    }
+
+
+def _image_text(metadata: dict[str, Any]) -> str:
+    if not metadata["cameras"]:
+        return "none"
+    height, width = metadata["image_size"]
+    codec = metadata["image_codec"]
+    quality = f" {metadata['image_quality']}" if codec == "jpeg" else ""
+    return f"{', '.join(metadata['cameras'])} ({height}x{width} {codec}{quality})"
+
+
+def _counted(values: Any) -> str:
+    counts = Counter(values).most_common()
+    if len(counts) == 1:
+        return str(counts[0][0])
+    return "; ".join(f"{value} ({number})" for value, number in counts)
+
+
+def _spread(values: list[float]) -> str:
+    """Mean, sample standard deviation and range."""
+    deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
+    return f"{np.mean(values):.2f} ± {deviation:.2f} ({min(values):.2f} … {max(values):.2f})"

@@ -1,0 +1,52 @@
+"""``bin/Replay.py``: its options, and what it does and says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from robo_manip_baselines.data import list_episodes
+from robo_manip_baselines.rollout.replay import deviation
+from robo_manip_baselines.rollout.videos import write_preview
+from robo_manip_baselines.runs.errors import RequestError
+
+EXAMPLE = "python bin/Replay.py dataset/FeedingEnv/episode_000000.hdf5 --video replay.mp4"
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Act recorded episodes out again, compare every state, and draw a video if asked."""
+
+    episodes: tyro.conf.Positional[tuple[Path, ...]]
+    """Episode files, or folders of them."""
+    video: Path | None = None
+    """Write an H.264 video of the replayed episodes here."""
+
+
+def replay_command(options: ReplayOptions) -> int:
+    """Replay what the options name; return 1 if any state strays from the recorded one.
+
+    Raises:
+        RequestError: no episode is named, or a file is damaged or of another model.
+    """
+    paths = [
+        path
+        for given in options.episodes
+        for path in (list_episodes(given) if given.is_dir() else [given])
+    ]
+    if not paths:
+        raise RequestError("no episode to replay; name files, or a folder that holds some")
+    strays = 0
+    for path in paths:
+        found = deviation(path)
+        strays += found.qpos > 0.0 or found.qvel > 0.0
+        print(  # noqa: T201
+            f"{path}: {found.steps} steps, qpos within {found.qpos:g}, qvel within {found.qvel:g}"
+        )
+    print(f"{len(paths) - strays} of {len(paths)} episodes replay bit for bit")  # noqa: T201
+    if options.video:
+        write_preview(options.video, paths)
+        print(f"video: {options.video}")  # noqa: T201
+    return int(strays > 0)

@@ -1,0 +1,116 @@
+"""Is there an OpenGL backend that MuJoCo can render with, and if not, what installs one?
+
+As a command (``python -m robo_manip_baselines.envs.mujoco.cell.opengl [--install]``) it prints
+one line: what was found, or what to run. ``--install`` runs that line at once when the user is
+root. It needs MuJoCo and the standard library only, so that it also works as a plain script,
+before this package is installed.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+
+# What Debian and Ubuntu call the libraries that each backend of MuJoCo opens; found by installing
+# them one by one on a minimal Debian 12. ``libgl1-mesa-dri`` brings the software renderer, which a
+# vendor's driver takes precedence over.
+APT_PACKAGES: dict[str, tuple[str, ...]] = {
+    "egl": ("libegl1", "libgl1", "libgl1-mesa-dri"),
+    "osmesa": ("libosmesa6",),
+    "glfw": ("libgl1", "libgl1-mesa-dri"),
+}
+DEFAULT_BACKEND = "egl"
+PROBE_TIMEOUT = 120.0  # seconds; a cold start of software rendering takes about two
+
+# Draws a red ball, off screen, in a process of its own: a backend is chosen once per process, and
+# a driver may crash.
+_PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 3'/><geom size='1' rgba='1 0 0 1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 32, 32)
+renderer.update_scene(data)
+if not renderer.render().any():
+    raise RuntimeError("the rendered image is black")
+from OpenGL import GL
+print("renderer:", GL.glGetString(GL.GL_RENDERER).decode())
+renderer.close()
+"""
+
+
+def backend_in_use() -> str:
+    """Return the backend that rendering will use: ``$MUJOCO_GL``, else EGL."""
+    return os.environ.get("MUJOCO_GL", "").strip().lower() or DEFAULT_BACKEND
+
+
+def apt_line(backend: str) -> str:
+    """Return the command that installs ``backend`` on Debian and Ubuntu."""
+    sudo = "" if os.geteuid() == 0 else "sudo "
+    packages = " ".join(APT_PACKAGES[backend])
+    return f"{sudo}apt-get update && {sudo}apt-get install -y --no-install-recommends {packages}"
+
+
+@functools.lru_cache(maxsize=1)
+def opengl_problem() -> str | None:
+    """Return None if an image can be rendered, else one line that says why not and what to do.
+
+    The answer is found by rendering in a subprocess (a second or two), once per process.
+    """
+    return _probe(backend_in_use())[1]
+
+
+def _probe(backend: str) -> tuple[str, str | None]:
+    """Render with ``backend`` and return the renderer's name and the problem, if there is one."""
+    if backend not in APT_PACKAGES:
+        return "", f"MUJOCO_GL={backend} renders nothing; valid: {', '.join(APT_PACKAGES)}"
+    environment = os.environ | {"MUJOCO_GL": backend}
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PROBE_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return "", f"OpenGL ({backend}) gave no image within {PROBE_TIMEOUT:.0f} s"
+    renderer = probe.stdout.partition("renderer:")[2].strip()
+    if probe.returncode == 0 and renderer:
+        return renderer, None
+    reason = (probe.stderr.strip().splitlines() or [f"exit code {probe.returncode}"])[-1]
+    if "No module named 'mujoco'" in reason:
+        return "", f"MuJoCo is not installed for {sys.executable}; run: pip install mujoco"
+    if backend == "glfw" and not os.environ.get("DISPLAY"):
+        return "", "MUJOCO_GL=glfw needs a display and $DISPLAY is not set; use MUJOCO_GL=egl"
+    return "", f"no OpenGL backend '{backend}' [{reason}]; run: {apt_line(backend)}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print what was found or what to do; with ``--install``, do it. Return the exit code."""
+    options = list(sys.argv[1:] if arguments is None else arguments)
+    if unknown := [option for option in options if option != "--install"]:
+        print(f"unknown option '{unknown[0]}'; valid: --install", file=sys.stderr)
+        return 2
+    backend = backend_in_use()
+    renderer, problem = _probe(backend)
+    can_install = backend in APT_PACKAGES and os.geteuid() == 0 and shutil.which("apt-get")
+    if problem and "apt-get" in problem and "--install" in options and can_install:
+        print(f"OpenGL: {problem}", flush=True)
+        subprocess.run(["bash", "-c", apt_line(backend)], check=False, stdin=subprocess.DEVNULL)
+        renderer, problem = _probe(backend)
+    if problem:
+        print(f"OpenGL: {problem}", file=sys.stderr)
+        return 2
+    print(f"OpenGL: {backend} works ({renderer})")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+"""Where the mouth is at every instant of an episode, now and in the frames ahead.
+
+Legend: P physics steps, T control steps, K = 6 frames from now to the longest horizon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel
+from robo_manip_baselines.envs.mujoco.face.motion import MotionSegment
+from robo_manip_baselines.observation import FRAME_PERIOD, MAX_HORIZON
+
+FACE_MOTIONS = ("episode", "after_lift")
+"""When the recorded motion starts: with the episode (paper, section IV.C), or when the cube has
+been lifted (paper, Algorithm 1, line 12)."""
+
+FRAMES_AHEAD = np.arange(MAX_HORIZON + 1) * FRAME_PERIOD
+"""s ahead at which the true mouth is told: now and at 1 ... 5 frames of 1/30 s."""
+
+
+@dataclass(frozen=True)
+class FaceReplay:
+    """A segment of recorded motion laid out on the clocks of the simulation, from its start.
+
+    Attributes:
+        bodies: for each mocap body, positions (P, 3) m and orientations (P, 4) wxyz, world.
+        mouth: (T, K, 3) m, world: the mouth now and at ``FRAMES_AHEAD``.
+        predicted: (T, K - 1, 3) m, world: the mouth at ``FRAMES_AHEAD`` but for now, as a trained
+            predictor foretold it; None if the recorded motion came without. Exact at video frames;
+            between them the predictor's last error is held.
+        jaw: (T,) m between the inner lips.
+        opening: (T, 2) m, half width and half height of the mouth's opening.
+        substeps: physics steps in a control step.
+    """
+
+    bodies: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+    mouth: NDArray[np.float64]
+    jaw: NDArray[np.float64]
+    opening: NDArray[np.float64]
+    substeps: int
+    predicted: NDArray[np.float64] | None = None
+
+    @classmethod
+    def lay_out(
+        cls,
+        segment: MotionSegment,
+        start_position: NDArray[np.float64],
+        face: FaceModel,
+        *,
+        duration: float,
+        timestep: float,
+        substeps: int,
+    ) -> FaceReplay:
+        """Interpolate a segment onto the physics clock.
+
+        Args:
+            segment: recorded motion, relative to its start.
+            start_position: (3,) m, world: the mouth at the start of the segment.
+            face: places the bodies of the face around the mouth.
+            duration: s to lay out; the face stands still afterwards.
+            timestep: s of physics.
+            substeps: physics steps in a control step.
+        """
+        physics = np.arange(round(duration / timestep) + 1) * timestep
+        displacement, orientation, recorded_jaw = segment.at(physics)
+        ahead, _, _ = segment.at(physics[::substeps, None] + FRAMES_AHEAD)
+        error = segment.prediction_error(physics[::substeps])
+        jaw = recorded_jaw + REST_OPENING
+        return cls(
+            bodies=face.body_poses(start_position + displacement, orientation, jaw),
+            mouth=start_position + ahead,
+            jaw=jaw[::substeps],
+            opening=np.stack(face.opening(jaw[::substeps]), axis=-1),
+            substeps=substeps,
+            predicted=None if error is None else start_position + ahead[:, 1:] + error,
+        )
+
+    def physics_index(self, step: int) -> int:
+        """Row of ``bodies`` at physics step ``step`` of the segment; held at both ends."""
+        return min(max(step, 0), (len(self.jaw) - 1) * self.substeps)
+
+    def control_index(self, step: int) -> int:
+        """Row of the other arrays at control step ``step`` of the segment; held likewise."""
+        return min(max(step, 0), len(self.jaw) - 1)

@@ -1,0 +1,281 @@
+"""FeedingEnv: bring a cube to the mouth of a person who moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from robo_manip_baselines.envs.mujoco.cell.scene import CUBE_SIZE, FACE, add_cube
+from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
+    Facts,
+    Progress,
+    from_mouth,
+    is_at_mouth,
+    is_inside_mouth,
+)
+from robo_manip_baselines.observation import CAMERAS, Corruption, ObservationSpec
+
+CUBE_LOW = np.array([0.12, 0.42])
+CUBE_HIGH = np.array([0.22, 0.58])
+"""m, world x and y between which the cube starts: between the arm and the head (public ALOHA: x 0
+to 0.2, y 0.4 to 0.6), far enough from the chin for a gripper that comes from above."""
+
+OFF_TABLE = -0.05
+"""m, height of the cube's centre below which it has fallen off the table."""
+
+
+class FeedingEnv(FaceEnv):
+    """Pick up a red cube and bring it to the mouth of a head that moves as a person moved.
+
+    The task of the paper's section IV.C. Units are SI; the world frame is x right, y forward, z up
+    with the table's top at z = 0; quaternions are wxyz. Control is at 50 Hz.
+
+    ## Action space
+
+    ``Box(7,)`` float32, targets of the right arm's position servos; with ``arms="both"``
+    ``Box(14,)``, left arm first. Values outside the bounds are clipped to them.
+
+    | num | action | min | max | joint | unit |
+    |---|---|---|---|---|---|
+    | 0 | waist | -pi | pi | right/waist | rad |
+    | 1 | shoulder | -1.850 | 1.257 | right/shoulder | rad |
+    | 2 | elbow | -1.763 | 1.606 | right/elbow | rad |
+    | 3 | forearm roll | -pi | pi | right/forearm_roll | rad |
+    | 4 | wrist angle | -1.868 | 2.234 | right/wrist_angle | rad |
+    | 5 | wrist rotate | -pi | pi | right/wrist_rotate | rad |
+    | 6 | gripper, position of a finger | 0.021 (closed) | 0.057 (open) | right/left_finger | m |
+
+    ## Observation space
+
+    A ``Dict`` of float32 vectors and uint8 images, chosen by ``obs``, ``cameras`` and
+    ``object_pose``. ``env.unwrapped.observation_spec.components()`` names every element.
+
+    | key | shape | when | content |
+    |---|---|---|---|
+    | ``state`` | (14,), both arms (28,) | always | per arm: 6 joint positions (rad), 6 joint
+    velocities (rad/s), gripper position (m) and velocity (m/s) |
+    | ``mouth`` | (4,) | ``obs="current"`` | mouth x, y, z (m) and distance gripper-mouth (m) |
+    | ``prediction`` | (5 (H+1),) | ``obs="current_pred"`` | for k = 0 ... H: time (s) and mouth
+    x, y, z (m) k frames of 1/30 s ahead; then the H+1 distances gripper-mouth (m) |
+    | ``object_position`` | (3,) | ``object_pose=True`` | centre of the cube (m) |
+    | ``images/<camera>`` | (height, width, 3) | per camera | RGB |
+
+    The time is that of the episode, so that it tells a policy how long the mouth has been moving.
+    With a ``corruption`` it is the time at which the mouth was seen, and the mouth is as it was
+    reported; the distances are those from the gripper as it is now.
+
+    ## Reward
+
+    1 on the step that first meets ``is_success``, and 1 on the step that first meets
+    ``is_success_strict``; 0 otherwise.
+
+    ## Starting state
+
+    The right arm at home with an open gripper, the left arm folded. Drawn from ``reset(seed=...)``:
+
+    - the cube's centre, uniform in x 0.12 ... 0.22 and y 0.42 ... 0.58, on the table;
+    - the mouth, (0, 0.5, 0.35) plus a uniform offset of +-0.05 along each axis;
+    - the segment of recorded motion, its start uniform over all starts of the library.
+
+    The mouth then follows the recorded displacement unchanged, with head orientation and jaw, for
+    12 s: from the start (``face_motion="episode"``) or from the moment at which the cube has been
+    lifted (``face_motion="after_lift"``, Algorithm 1). The jaw is held open by
+    ``face.REST_OPENING`` more than recorded: a person who waits to be fed.
+
+    ## Info
+
+    | key | type | content |
+    |---|---|---|
+    | ``is_success`` | bool | Algorithm 1's condition has been met with the cube held and lifted:
+    gripper and mouth less than 0.03 m apart along x, 0.01 m along y, 0.01 m along z |
+    | ``is_success_strict`` | bool | ``is_success``, and the cube was let go with its centre inside
+    the mouth opening, and since the lift the gripper has not touched lips or face |
+    | ``mouth_position`` | (3,) | true mouth (m) |
+    | ``gripper_position`` | (3,) | site ``right/gripper`` (m) |
+    | ``cube_offset`` | (3,) | centre of the cube from the mouth (m) in the face's axes: out along
+    its normal, across to the person's left, up |
+    | ``phase`` | str | reach, grasp, carry, deliver or release |
+    | ``time_since_lift`` | float or None | s; None before |
+    | ``completion_time`` | float or None | s from the lift to ``is_success``; None before |
+    | ``face_force`` | float | N, the largest normal force between the robot and the face in the
+    step |
+
+    ## Episode end
+
+    Terminates when the cube was delivered (``is_success``) and let go and the gripper has
+    withdrawn by 0.12 m, or when the cube falls off the table. Truncated after 600 steps (12 s).
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | ``obs`` | ``"baseline"`` | preset: baseline, current, current_pred |
+    | ``horizon`` | 2 | frames that current_pred looks ahead, 1 to 5 |
+    | ``cameras`` | all three | any of top, angle, front_close; ``()`` for none |
+    | ``image_size`` | (480, 640) | height and width |
+    | ``object_pose`` | False | show the cube's position |
+    | ``corruption`` | None | what stands between true and shown mouth: an
+    ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
+    3}``; None shows the truth |
+    | ``arms`` | ``"right"`` | right or both |
+    | ``face_motion`` | ``"episode"`` | episode or after_lift |
+    | ``clips`` | None | ids of recorded clips to draw from; all if None |
+    | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
+    None |
+    | ``shadows``, ``multisamples`` | False, 0 | prettier and slower images, for videos |
+    | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle`` |
+
+    Raises ``RequestError``, a ``ValueError``, when an argument is not valid.
+
+    ## Version history
+
+    - v0: first release.
+    """
+
+    def __init__(
+        self,
+        *,
+        obs: str = "baseline",
+        horizon: int = 2,
+        cameras: Sequence[str] = CAMERAS,
+        image_size: tuple[int, int] = (480, 640),
+        object_pose: bool = False,
+        arms: str = "right",
+        corruption: Corruption | Mapping[str, Any] | None = None,
+        face_motion: str = "episode",
+        clips: Sequence[str] | None = None,
+        motion_library: str | None = None,
+        shadows: bool = False,
+        multisamples: int = 0,
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(
+            spec=ObservationSpec(
+                obs=obs,
+                horizon=horizon,
+                cameras=tuple(cameras),
+                image_size=(image_size[0], image_size[1]),
+                object_pose=object_pose,
+                arms=arms,
+                corruption=(
+                    Corruption.of(corruption) if isinstance(corruption, Mapping) else corruption
+                ),
+            ),
+            face_motion=face_motion,
+            clips=clips,
+            motion_library=motion_library,
+            shadows=shadows,
+            multisamples=multisamples,
+            render_mode=render_mode,
+        )
+        model = self.model
+        self._cube_qpos = int(model.joint("cube").qposadr[0])
+        self._cube_body = model.body("cube").id
+        self._cube_geom = model.geom("cube").id
+        self._is_finger = np.stack(
+            [_geoms_of(model, f"right/{side}_finger_link") for side in ("left", "right")]
+        )
+        self._is_face = model.geom_contype == FACE
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """Add the red cube."""
+        add_cube(scene)
+
+    def reset_objects(self, rng: np.random.Generator) -> None:
+        """Put the cube somewhere on the table in front of the head."""
+        x, y = rng.uniform(CUBE_LOW, CUBE_HIGH)
+        self.data.qpos[self._cube_qpos : self._cube_qpos + 7] = (x, y, CUBE_SIZE / 2, 1, 0, 0, 0)
+
+    def object_position(self) -> NDArray[np.float64]:
+        """(3,) m, world: centre of the cube."""
+        return self.data.xpos[self._cube_body].copy()
+
+    @property
+    def cube_offset(self) -> NDArray[np.float64]:
+        """(3,) m: centre of the cube from the mouth, see ``from_mouth``."""
+        axes = self.data.site_xmat[self._mouth_site].reshape(3, 3)
+        return from_mouth(self.object_position(), self.mouth_track[0], axes)
+
+    @property
+    def object_pose(self) -> NDArray[np.float64]:
+        """(7,) position (m) and orientation (wxyz) of the cube, world."""
+        return self.data.qpos[self._cube_qpos : self._cube_qpos + 7].copy()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """Start an episode; every random choice comes from ``seed``."""
+        self.progress = Progress()
+        self._clear_contacts()
+        observation, _ = super().reset(seed=seed, options=options)
+        return observation, self.info()
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
+        """Move for 0.02 s; see the class for what comes back."""
+        self._clear_contacts()
+        self.simulate(action)
+        before = self.progress
+        self.progress = before.advance(self._facts())
+        if self.progress.lift_time is not None:
+            self.start_motion()
+        reward = float(self.progress.is_success and not before.is_success) + float(
+            self.progress.is_success_strict and not before.is_success_strict
+        )
+        delivered = self.progress.is_success and self.progress.is_clear
+        fell = bool(self.object_position()[2] < OFF_TABLE)
+        return self.observe(), reward, delivered or fell, False, self.info()
+
+    def info(self) -> dict[str, Any]:
+        """What the class docstring lists under Info."""
+        progress = self.progress
+        return {
+            "is_success": progress.is_success,
+            "is_success_strict": progress.is_success_strict,
+            "mouth_position": self.mouth_track[0],
+            "gripper_position": self.gripper_position,
+            "cube_offset": self.cube_offset,
+            "phase": progress.phase.name.lower(),
+            "time_since_lift": progress.time_since_lift(self.time),
+            "completion_time": progress.completion_time,
+            "face_force": self._face_force,
+        }
+
+    def watch_contacts(self) -> None:
+        """Note which fingers touch the cube, and how hard the robot touches the face."""
+        pairs = self.data.contact.geom
+        on_cube = (pairs == self._cube_geom).any(axis=1)
+        self._fingers_on_cube |= self._is_finger[:, pairs[on_cube]].any(axis=(1, 2))
+        for contact in np.flatnonzero(self._is_face[pairs].any(axis=1)):
+            mujoco.mj_contactForce(self.model, self.data, contact, self._wrench)
+            self._face_force = max(self._face_force, float(self._wrench[0]))
+
+    def _clear_contacts(self) -> None:
+        self._fingers_on_cube = np.zeros(2, dtype=bool)
+        self._wrench = np.zeros(6)
+        self._face_force = 0.0
+
+    def _facts(self) -> Facts:
+        mouth, gripper = self.mouth_track[0], self.gripper_position
+        half_width, half_height = self.mouth_opening.tolist()
+        return Facts(
+            time=self.time,
+            is_held=bool(self._fingers_on_cube.all()),
+            is_touched=bool(self._fingers_on_cube.any()),
+            cube_height=float(self.object_position()[2]),
+            is_at_mouth=is_at_mouth(gripper, mouth),
+            is_inside_mouth=is_inside_mouth(self.cube_offset, half_width, half_height),
+            touches_face=self._face_force > 0.0,
+            gripper_distance=float(np.linalg.norm(gripper - mouth)),
+        )
+
+
+def _geoms_of(model: mujoco.MjModel, body: str) -> NDArray[np.bool_]:
+    """Mark the geoms of a body, (ngeom,)."""
+    return model.geom_bodyid == model.body(body).id

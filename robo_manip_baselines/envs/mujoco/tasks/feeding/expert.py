@@ -1,0 +1,150 @@
+"""The scripted expert that feeds: Algorithm 1 of the paper, and one that looks ahead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mink
+import numpy as np
+from numpy.typing import NDArray
+
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
+from robo_manip_baselines.envs.mujoco.expert.kinematics import ArmKinematics
+from robo_manip_baselines.envs.mujoco.expert.phases import (
+    DOWN,
+    Approach,
+    Command,
+    Follow,
+    Grip,
+    Phase,
+    Reach,
+    View,
+    level_at,
+)
+from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import is_at_mouth
+from robo_manip_baselines.observation import FRAME_PERIOD
+
+GRASP_OFFSET = 0.03
+"""m from the gripper site to the cube's centre, along the fingers. The fingers hold the rear of the
+cube, so that its centre is at the lips when Algorithm 1's condition is met 0.03 m before them."""
+
+CLEARANCE = 0.10
+"""m above the cube at which the gripper waits before it descends."""
+
+LIFT = 0.12
+"""m straight up after the grasp, more than ``feeding_success.LIFT_HEIGHT``."""
+
+STANDOFF = np.array([0.20, 0.0, 0.0])
+"""m from where the mouth is to where the approach starts, level and straight in front of it."""
+
+INSERTION = np.array([0.028, 0.0, 0.0])
+"""m from the mouth to the gripper when it lets go: inside the 0.03 m of Algorithm 1, so that who
+learns from it is shown a place where the condition holds, not its edge. The cube's centre is then
+between the lips, 2 mm behind the mouth's centre, and the finger tips are 10 mm before it, at the
+front of the lips."""
+
+WITHDRAWAL = np.array([0.14, 0.0, 0.0])
+"""m from the mouth to the gripper before it turns home."""
+
+
+@dataclass(frozen=True)
+class FeedingExpertConfig:
+    """What tells one scripted expert from another.
+
+    Attributes:
+        lead: s; it aims where the mouth will be this much later.
+    """
+
+    lead: float = 0.0
+
+
+EXPERTS: dict[str, FeedingExpertConfig] = {
+    "reactive": FeedingExpertConfig(),
+    "anticipatory": FeedingExpertConfig(lead=4 * FRAME_PERIOD),
+}
+"""``reactive`` is Algorithm 1 as published; ``anticipatory`` knows the recorded future."""
+
+
+class FeedingExpert:
+    """Feeds in the environment it is given.
+
+    Args:
+        env: the environment, unwrapped.
+        config: see ``EXPERTS``.
+    """
+
+    def __init__(self, env: FeedingEnv, config: FeedingExpertConfig) -> None:
+        self._env, self._config = env, config
+        self._kinematics = ArmKinematics("right")
+
+    def reset(self) -> None:
+        """Begin with the first phase; call it after the environment's reset."""
+        self._joints = np.array(HOME_QPOS)
+        home = self._kinematics.forward(self._joints)
+        self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
+        self._phases = _phases(self._config, self._command)
+        self._phase = self._phases.pop(0)
+        self._phase.start(self._view(), self._command)
+
+    def act(self) -> NDArray[np.float32]:
+        """Return the next action, (7,): joint targets in rad and the finger in m."""
+        view = self._view()
+        while self._phases and self._phase.is_done(view):
+            self._phase = self._phases.pop(0)
+            self._phase.start(view, self._command)
+        self._command = self._phase.step(view)
+        target = mink.SE3.from_rotation_and_translation(
+            self._command.orientation, self._command.position
+        )
+        self._joints = self._kinematics.inverse(target, self._joints)
+        return np.append(self._joints, self._command.finger).astype(np.float32)
+
+    def _view(self) -> View:
+        env = self._env
+        mouth = env.mouth_track
+        return View(
+            object_position=env.object_position(),
+            mouth_track=mouth,
+            time_since_lift=env.progress.time_since_lift(env.time),
+            is_at_mouth=is_at_mouth(env.gripper_position, mouth[0]),
+        )
+
+
+def _phases(config: FeedingExpertConfig, home: Command) -> list[Phase]:
+    """List the phases of one episode, in order."""
+
+    def above(view: View, last: Command) -> Command:
+        height = np.array([0.0, 0.0, GRASP_OFFSET + CLEARANCE])
+        return Command(view.object_position + height, DOWN, FINGER_OPEN)
+
+    def grasp(view: View, last: Command) -> Command:
+        height = np.array([0.0, 0.0, GRASP_OFFSET])
+        return Command(view.object_position + height, DOWN, FINGER_OPEN)
+
+    def lifted(view: View, last: Command) -> Command:
+        return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
+
+    def standoff(view: View, last: Command) -> Command:
+        position = view.mouth() + STANDOFF
+        return Command(position, level_at(position), last.finger)
+
+    def go_home(view: View, last: Command) -> Command:
+        return home
+
+    lead = config.lead
+    return [
+        # Phase 1: approach and grasp the cube.
+        Reach(above),
+        Reach(grasp, speed=0.15),
+        Grip(FINGER_CLOSED, 0.4),
+        Reach(lifted, speed=0.2),
+        Reach(standoff, least_duration=1.2),
+        # Phase 2: move towards the mouth.
+        Approach(lead=lead),
+        # Phase 3: insert the cube into the mouth, let go, retract.
+        Follow(INSERTION, 0.4, lead=lead),
+        Follow(INSERTION, 0.3, finger=FINGER_OPEN, lead=lead),
+        Follow(WITHDRAWAL, 0.6, lead=lead, speed=0.3),
+        Reach(go_home),
+    ]

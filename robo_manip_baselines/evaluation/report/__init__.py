@@ -1,1 +1,0 @@
-"""``report.html``: a benchmark on one page, see ``docs/benchmark_report.md``."""

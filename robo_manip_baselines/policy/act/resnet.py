@@ -1,0 +1,218 @@
+"""ResNet-18 without its classifier, its parameters named as torchvision names them.
+
+Legend: I images, H and W their height and width, h = ceil(H / 32), w = ceil(W / 32).
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import cast
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from robo_manip_baselines.runs.errors import RequestError
+
+STRIDE = 32
+"""Pixels of the image to a cell of the last feature map."""
+
+WIDTHS = (64, 128, 256, 512)
+"""Channels of the feature maps of the four stages; the last one's is what comes out."""
+
+BLOCKS_PER_STAGE = 2
+
+# Mean and standard deviation of ImageNet's colours from 0 to 1, with which torchvision's weights
+# were trained; public ACT uses them too.
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+
+
+class FrozenBatchNorm(nn.Module):
+    """Batch normalisation whose statistics and scales never change (DETR): a constant y = a x + b.
+
+    A batch of 8 is too small for statistics of its own. The constants are buffers, so they are
+    saved and loaded but not trained.
+    """
+
+    weight: Tensor
+    bias: Tensor
+    running_mean: Tensor
+    running_var: Tensor
+
+    def __init__(self, channels: int, eps: float = 1e-5) -> None:
+        super().__init__()
+        self.eps = eps
+        self.register_buffer("weight", torch.ones(channels))
+        self.register_buffer("bias", torch.zeros(channels))
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+
+    def scale_and_shift(self) -> tuple[Tensor, Tensor]:
+        """Return a and b, each of one element a channel."""
+        scale = self.weight * torch.rsqrt(self.running_var + self.eps)
+        return scale, self.bias - self.running_mean * scale
+
+
+def convolve(x: Tensor, conv: nn.Conv2d, norm: nn.Module) -> Tensor:
+    """Convolve and normalise in one pass over the image: the constants go into the kernel."""
+    if isinstance(norm, FrozenBatchNorm):
+        kernel, shift = _fold(conv, norm)
+        return nn.functional.conv2d(x, kernel, shift, conv.stride, conv.padding)
+    return conv(x)
+
+
+def _fold(conv: nn.Conv2d, norm: FrozenBatchNorm) -> tuple[Tensor, Tensor]:
+    """Kernel, in the order of memory that images come in, and bias that do the work of both."""
+    scale, shift = norm.scale_and_shift()
+    kernel = conv.weight * scale[:, None, None, None]
+    return kernel.contiguous(memory_format=torch.channels_last), shift
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions beside a shortcut."""
+
+    def __init__(self, wide: int, narrow: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(wide, narrow, 3, stride, 1, bias=False)
+        self.bn1 = FrozenBatchNorm(narrow)
+        self.conv2 = nn.Conv2d(narrow, narrow, 3, 1, 1, bias=False)
+        self.bn2 = FrozenBatchNorm(narrow)
+        self.downsample: nn.Sequential | None = None
+        if stride != 1 or wide != narrow:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(wide, narrow, 1, stride, bias=False), FrozenBatchNorm(narrow)
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the feature map of the next block."""
+        change = nn.functional.relu(convolve(x, self.conv1, self.bn1), inplace=True)
+        change = convolve(change, self.conv2, self.bn2)
+        if self.downsample is not None:
+            conv, norm = self.downsample
+            x = convolve(x, cast("nn.Conv2d", conv), norm)
+        return nn.functional.relu(change.add_(x), inplace=True)
+
+
+class ResNet18(nn.Module):
+    """From pictures to a feature map (He et al. 2016).
+
+    Random weights are drawn as torchvision draws them (Kaiming, by what goes out). Without batch
+    statistics the sum of a block and its shortcut doubles the variance, but each strided stage
+    halves it, so that activations grow fivefold over the whole network and need no other remedy.
+
+    Attributes:
+        features: channels that come out.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, WIDTHS[0], 7, 2, 3, bias=False)
+        self.bn1 = FrozenBatchNorm(WIDTHS[0])
+        wide = WIDTHS[0]
+        for stage, narrow in enumerate(WIDTHS, start=1):
+            blocks = [BasicBlock(wide, narrow, 1 if stage == 1 else 2)]
+            blocks += [BasicBlock(narrow, narrow, 1) for _ in range(BLOCKS_PER_STAGE - 1)]
+            self.add_module(f"layer{stage}", nn.Sequential(*blocks))
+            wide = narrow
+        self.features = wide
+        self.register_buffer("mean", 255.0 * torch.tensor(MEAN)[:, None, None], persistent=False)
+        self.register_buffer(
+            "scale", 1.0 / (255.0 * torch.tensor(STD))[:, None, None], persistent=False
+        )
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (I, 512, h, w) for (I, H, W, 3) uint8 pictures."""
+        # (H, W, 3) pictures seen as (3, H, W) are in the channels-last order already.
+        x = (images.permute(0, 3, 1, 2) - self.mean) * self.scale
+        x = convolve(x.to(self.conv1.weight.dtype), self.conv1, self.bn1)
+        # Rectifying after the maximum gives the same numbers and has a quarter of them to do.
+        x = nn.functional.relu(nn.functional.max_pool2d(x, 3, 2, 1), inplace=True)
+        for stage in range(1, len(WIDTHS) + 1):
+            x = self.get_submodule(f"layer{stage}")(x)
+        return x
+
+
+def fold_for_inference(backbone: ResNet18) -> None:
+    """Replace every convolution and its normalisation by one convolution that does both."""
+    for parent in list(backbone.modules()):
+        for conv_name, norm_name in (("conv1", "bn1"), ("conv2", "bn2"), ("0", "1")):
+            conv, norm = getattr(parent, conv_name, None), getattr(parent, norm_name, None)
+            if not isinstance(conv, nn.Conv2d) or not isinstance(norm, FrozenBatchNorm):
+                continue
+            kernel, shift = _fold(conv, norm)
+            conv.weight, conv.bias = nn.Parameter(kernel), nn.Parameter(shift)
+            setattr(parent, norm_name, nn.Identity())
+
+
+def feature_size(image: tuple[int, int]) -> tuple[int, int]:
+    """Return (h, w) of the feature map of an (H, W) picture."""
+    return -(-image[0] // STRIDE), -(-image[1] // STRIDE)
+
+
+SUFFIXES = (".safetensors", ".pth", ".pt")
+
+_IGNORED_PREFIX = "fc."  # the classifier
+_IGNORED_SUFFIX = ".num_batches_tracked"  # how long the statistics were gathered
+
+
+def load_backbone(backbone: ResNet18 | None, path: str | Path) -> None:
+    """Load the state dict of a torchvision ResNet-18 into ``backbone``.
+
+    A ``.pth`` file is read by PyTorch's reader of tensors alone, which runs no code of the file.
+
+    Raises:
+        RequestError: there is no backbone, no such file, or it holds something else.
+    """
+    path = Path(path)
+    if backbone is None:
+        raise RequestError(f"backbone_weights '{path}' without cameras: leave one of the two out")
+    found = {
+        name: value
+        for name, value in _read(path).items()
+        if not name.startswith(_IGNORED_PREFIX) and not name.endswith(_IGNORED_SUFFIX)
+    }
+    wanted = backbone.state_dict()
+    for name in sorted(wanted.keys() | found.keys()):
+        if name not in found:
+            raise _refusal(path, f"'{name}' is not in it")
+        if name not in wanted:
+            raise _refusal(path, f"it has '{name}' too")
+        if found[name].shape != wanted[name].shape:
+            shapes = f"{tuple(found[name].shape)}, not {tuple(wanted[name].shape)}"
+            raise _refusal(path, f"'{name}' is of shape {shapes}")
+    backbone.load_state_dict(found)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    if path.suffix not in SUFFIXES:
+        raise RequestError(f"backbone_weights '{path}': must be one of {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise RequestError(f"backbone_weights '{path}': there is no such file")
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about the age of the file's format
+            found = torch.load(path, map_location="cpu", weights_only=True)
+    except SafetensorError as error:
+        raise _refusal(path, f"it is no safetensors file ({error})") from error
+    except Exception as error:  # unpickling fails in every way there is
+        raise _refusal(path, "it holds more than tensors, or is damaged") from error
+    if not isinstance(found, dict) or not all(isinstance(v, Tensor) for v in found.values()):
+        raise _refusal(path, "it is no state dict")
+    return found
+
+
+def _refusal(path: Path, reason: str) -> RequestError:
+    return RequestError(
+        f"backbone_weights '{path}' is no state dict of torchvision's resnet18: {reason}"
+    )

@@ -1,0 +1,374 @@
+"""One demonstration: a scripted expert acts in an environment, and everything is written down."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import logging
+import platform
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from robo_manip_baselines.data import (
+    atomic_file,
+    encode_image,
+    episode_path,
+    finished_seeds,
+    prepare_folder,
+    read_metadata,
+    remove_temporaries,
+    write_episode,
+)
+from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
+from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, world_of
+from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS, FeedingExpert
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase
+from robo_manip_baselines.envs.mujoco.tasks.registry import env_id, make_env
+from robo_manip_baselines.observation import FRAME_PERIOD
+from robo_manip_baselines.runs.errors import RequestError, require_choice
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What one episode leaves behind, as ``data.write_episode`` takes it.
+
+    Attributes:
+        arrays: field -> (T, ...) array.
+        images: camera -> T encoded frames.
+        attributes: attribute -> value.
+    """
+
+    arrays: dict[str, NDArray[Any]]
+    images: dict[str, list[NDArray[np.uint8]]]
+    attributes: dict[str, Any]
+
+
+def demonstrate(
+    env: gymnasium.Env[Any, Any], expert: str, seed: int, *, codec: str, quality: int
+) -> Demonstration:
+    """Let an expert act through one episode.
+
+    Args:
+        env: made by ``make_env``; its cameras are recorded.
+        expert: a name of ``EXPERTS``.
+        seed: of the episode.
+        codec: see ``data.encode_image``.
+        quality: of JPEG, 1 to 100.
+    """
+    world = env.unwrapped
+    if not isinstance(world, FeedingEnv):
+        raise TypeError(f"the scripted experts act in FeedingEnv, not in {type(world).__name__}")
+    actor = FeedingExpert(world, EXPERTS[expert])
+    rows: dict[str, list[Any]] = defaultdict(list)
+    images: dict[str, list[NDArray[np.uint8]]] = {
+        camera: [] for camera in world.observation_spec.cameras
+    }
+    observation, _ = env.reset(seed=seed)
+    start = world.object_pose
+    actor.reset()
+    ended = False
+    while not ended:
+        action = actor.act()
+        for name, value in _row(world).items():
+            rows[name].append(value)
+        rows["action"].append(action)
+        for key, camera in world.observation_spec.image_keys().items():
+            images[camera].append(encode_image(observation[key], codec, quality))
+        observation, _, terminated, truncated, _ = env.step(action)
+        rows["is_success"].append(world.progress.is_success)
+        rows["is_success_strict"].append(world.progress.is_success_strict)
+        ended = terminated or truncated
+    attributes = {
+        **_attributes(env, world),
+        "seed": seed,
+        "expert": expert,
+        "object_initial_pose": start,
+        "image_codec": codec,
+        "image_quality": quality,
+    }
+    return Demonstration(
+        {name: np.asarray(values) for name, values in rows.items()}, images, attributes
+    )
+
+
+def _row(world: FeedingEnv) -> dict[str, Any]:
+    """Return what is so before an action."""
+    truth = world.truth()
+    return {
+        "time": world.time,
+        "joint_position": truth.joint_position.ravel(),
+        "joint_velocity": truth.joint_velocity.ravel(),
+        "gripper_position": truth.gripper_position,
+        "gripper_velocity": truth.gripper_velocity,
+        "end_effector_position": truth.end_effector_position,
+        "end_effector_orientation": world.gripper_orientation,
+        "mouth_position": truth.mouth_position,
+        **({} if truth.predicted_mouth is None else {"predicted_mouth": truth.predicted_mouth}),
+        "head_orientation": world.head_orientation,
+        "jaw_opening": world.jaw_opening,
+        "object_pose": world.object_pose,
+        "phase": np.int8(world.progress.phase),
+        "qpos": world.data.qpos.copy(),
+        "qvel": world.data.qvel.copy(),
+    }
+
+
+def _attributes(env: gymnasium.Env[Any, Any], world: FeedingEnv) -> dict[str, Any]:
+    """Return where the episode came from and how it ended."""
+    if env.spec is None:
+        raise ValueError("the environment must be made by its id, so that it can be made again")
+    segment, progress = world.segment, world.progress
+    joints, actions = world.joint_names, world.action_names
+    return {
+        "env_id": env.spec.id,
+        "env_kwargs": dict(env.spec.kwargs),
+        "is_success": progress.is_success,
+        "is_success_strict": progress.is_success_strict,
+        "completion_time": np.nan if progress.completion_time is None else progress.completion_time,
+        "motion_clip": segment.clip,
+        "motion_subject": segment.subject,
+        "motion_start_index": segment.index,
+        "motion_start_time": segment.start / segment.fps,
+        "face_offset": world.face_offset,
+        "control_period": CONTROL_PERIOD,
+        "prediction_period": FRAME_PERIOD,
+        "phase_names": [phase.name.lower() for phase in Phase],
+        "joint_names": joints,
+        "action_names": actions,
+        "xml_hash": world.xml_hash,
+        "versions": {
+            "python": platform.python_version(),
+            "mujoco": mujoco.__version__,
+            "numpy": np.__version__,
+            "robo_manip_baselines": version("robo_manip_baselines"),
+        },
+    }
+
+
+SUMMARY = "summary.json"
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What to collect, and how.
+
+    Attributes:
+        env: name of the environment.
+        out: folder of the demonstrations; failed episodes go to its ``failed/``.
+        expert: a name of ``EXPERTS``.
+        seeds: of the episodes, one each.
+        env_kwargs: arguments of the environment.
+        codec, quality: of the images.
+        workers: processes.
+    """
+
+    env: str
+    out: Path
+    expert: str
+    seeds: range
+    env_kwargs: dict[str, Any]
+    codec: str = "jpeg"
+    quality: int = DEFAULT_QUALITY
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        env_id(self.env)
+        require_choice("expert", self.expert, EXPERTS)
+        require_choice("image codec", self.codec, CODECS)
+        if self.seeds.start < 0:
+            raise RequestError(f"seed {self.seeds.start}: must be 0 or more")
+        if len(self.seeds) < 1:
+            count = self.seeds.stop - self.seeds.start
+            raise RequestError(f"num_episodes {count}: must be 1 or more")
+        if self.workers < 1:
+            raise RequestError(f"workers {self.workers}: must be at least 1")
+        if not 1 <= self.quality <= 100:
+            raise RequestError(f"image quality {self.quality}: must be 1 to 100")
+
+    def path(self, seed: int) -> Path | None:
+        """Return the file of a finished seed, wherever it is; None if there is none."""
+        for success in (True, False):
+            path = episode_path(self.out, seed, success)
+            if path.is_file():
+                return path
+        return None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a collection went.
+
+    Attributes:
+        episodes: how many there are.
+        successes, strict_successes: how many of them succeeded.
+        failed_seeds: seeds that did not.
+        completion_time_mean, completion_time_sd: s, over successes; None without any.
+        steps: control steps of the episodes that this run recorded.
+        steps_per_second: of this run, all workers together; None if nothing was left to do.
+    """
+
+    episodes: int
+    successes: int
+    strict_successes: int
+    failed_seeds: list[int]
+    completion_time_mean: float | None
+    completion_time_sd: float | None
+    steps: int
+    steps_per_second: float | None
+
+
+def collect(collection: Collection) -> Summary:
+    """Record every seed that has not been recorded yet, and write ``summary.json``.
+
+    Killed at any moment, it leaves whole episodes only; the same call carries on from there.
+
+    Raises:
+        RequestError: the request cannot be met; nothing has been written then.
+    """
+    # Everything about the request that can be wrong is found out here, before any file exists.
+    with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
+        env.reset(seed=collection.seeds.start)
+        _refuse_other_settings(collection, env)
+        prepare_folder(collection.out)
+        remove_temporaries(collection.out)
+        done = finished_seeds(collection.out)
+        todo = [seed for seed in collection.seeds if seed not in done]
+        if len(todo) < len(collection.seeds):
+            logger.info(
+                "%d of %d episodes are there already",
+                len(collection.seeds) - len(todo),
+                len(collection.seeds),
+            )
+        steps, begin = 0, time.perf_counter()
+        with tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress:
+            for count in _record_all(collection, env, todo):
+                steps += count
+                progress.update()
+        elapsed = time.perf_counter() - begin
+    summary = summarise(collection, steps, steps / elapsed if todo else None)
+    _write_summary(collection, summary)
+    return summary
+
+
+def summarise(collection: Collection, steps: int, steps_per_second: float | None) -> Summary:
+    """Sum up what the files of a collection say."""
+    outcomes = {
+        seed: read_metadata(path) for seed in collection.seeds if (path := collection.path(seed))
+    }
+    times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
+    return Summary(
+        episodes=len(outcomes),
+        successes=len(times),
+        strict_successes=sum(bool(o["is_success_strict"]) for o in outcomes.values()),
+        failed_seeds=[seed for seed, o in outcomes.items() if not o["is_success"]],
+        completion_time_mean=float(np.mean(times)) if times else None,
+        completion_time_sd=float(np.std(times, ddof=1)) if len(times) > 1 else None,
+        steps=steps,
+        steps_per_second=steps_per_second,
+    )
+
+
+def _record_all(
+    collection: Collection, env: gymnasium.Env[Any, Any], seeds: list[int]
+) -> Iterator[int]:
+    """Record seeds, here or in worker processes; yield the steps of each as it is finished."""
+    workers = min(collection.workers, len(seeds))
+    if workers <= 1:
+        for seed in seeds:
+            yield _record(collection, env, seed)
+        return
+    # Spawned, not forked: an OpenGL context does not survive a fork.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (collection,))
+    try:
+        futures = [pool.submit(_record_in_worker, seed) for seed in seeds]
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> int:
+    """Record one episode into its file; return its number of steps."""
+    demonstration = demonstrate(
+        env, collection.expert, seed, codec=collection.codec, quality=collection.quality
+    )
+    path = episode_path(collection.out, seed, demonstration.attributes["is_success"])
+    write_episode(path, demonstration.arrays, demonstration.images, demonstration.attributes)
+    return len(demonstration.arrays["time"])
+
+
+_worker: dict[str, Any] = {}
+"""What a worker process keeps between its episodes; empty in every other process."""
+
+
+def _start_worker(collection: Collection) -> None:
+    # Ctrl-C reaches the whole process group: workers stop at once, the parent does the talking.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    env = make_env(collection.env, **collection.env_kwargs)
+    atexit.register(env.close)
+    _worker.update(collection=collection, env=env)
+
+
+def _record_in_worker(seed: int) -> int:
+    return _record(_worker["collection"], _worker["env"], seed)
+
+
+def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:
+    """Refuse to mix episodes of other settings with those that the folder holds.
+
+    Raises:
+        RequestError: naming the first setting that differs.
+    """
+    if not collection.out.is_dir():
+        return
+    paths = (collection.path(seed) for seed in sorted(finished_seeds(collection.out)))
+    present = next((path for path in paths if path), None)
+    if present is None:
+        return
+    there = read_metadata(present)
+    wanted = {
+        "env_id": env_id(collection.env),
+        # As JSON would give them back: tuples become lists.
+        "env_kwargs": json.loads(json.dumps(collection.env_kwargs)),
+        "expert": collection.expert,
+        "image_codec": collection.codec,
+        "image_quality": collection.quality,
+        "xml_hash": world_of(env).xml_hash,
+    }
+    for name, value in wanted.items():
+        if there[name] != value:
+            raise RequestError(
+                f"'{collection.out}' holds episodes with {name} {there[name]}, not {value}; "
+                "give another --out or remove that folder"
+            )
+
+
+def _write_summary(collection: Collection, summary: Summary) -> None:
+    content = {
+        "env": env_id(collection.env),
+        "env_kwargs": collection.env_kwargs,
+        "expert": collection.expert,
+        "first_seed": collection.seeds.start,
+        "workers": collection.workers,
+        **asdict(summary),
+    }
+    with atomic_file(collection.out / SUMMARY) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,428 @@
+"""Videos of what happened: pictures side by side, tracks and captions drawn in, H.264 written.
+
+Images are RGB, (H, W, 3) uint8; drawing functions return a new image and leave theirs alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from robo_manip_baselines.data import EpisodeReader, read_metadata
+from robo_manip_baselines.data.files import atomic_file
+from robo_manip_baselines.envs.mujoco.cell.rendering import project
+from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, FaceEnv, world_of
+from robo_manip_baselines.observation import CAMERAS, ObservationSpec
+from robo_manip_baselines.rollout.replay import remake_env, replay
+from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.rollout.rollout import Recording
+from robo_manip_baselines.rollout.workers import Task, split_vector
+
+Colour = tuple[int, int, int]
+
+YELLOW: Colour = (255, 214, 10)
+WHITE: Colour = (255, 255, 255)
+BLACK: Colour = (0, 0, 0)
+
+
+class VideoWriter:
+    """An H.264 file that browsers play, there when it is whole and not before.
+
+    Use as a context manager; the file appears when the block ends well. The first frame decides
+    the size; an odd height or width gets a row or column of its edge repeated, because 4:2:0
+    video has even sizes only.
+
+    Args:
+        path: file to write, ``….mp4``.
+        fps: frames a second.
+        crf: quality of libx264, 0 (lossless) to 51; 20 shows no blocks in rendered scenes.
+    """
+
+    def __init__(self, path: str | Path, fps: float, *, crf: int = 20) -> None:
+        if fps <= 0:
+            raise ValueError(f"a video needs a positive number of frames a second, not {fps}")
+        self.path = Path(path)
+        self._fps = Fraction(fps).limit_denominator(1001)
+        self._crf = crf
+        self._stack = ExitStack()
+        self._shape: tuple[int, ...] | None = None
+
+    def __enter__(self) -> VideoWriter:
+        temporary = self._stack.enter_context(atomic_file(self.path))
+        # The index goes to the front so that a browser starts to play before all has arrived.
+        self._container = self._stack.enter_context(
+            av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"})
+        )
+        stream = self._container.add_stream("libx264", rate=self._fps)
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": str(self._crf), "preset": "medium"}
+        stream.codec_context.thread_count = 1  # the same bytes whatever the number of cores
+        self._stream = stream
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if exc is None:
+            try:
+                self._finish()
+            except BaseException as error:
+                self._stack.__exit__(type(error), error, error.__traceback__)
+                raise
+        self._stack.__exit__(exc_type, exc, traceback)
+
+    def write(self, image: np.ndarray) -> None:
+        """Append a frame.
+
+        Raises:
+            ValueError: if it is not (H, W, 3) uint8, or unlike the first.
+        """
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise ValueError(f"a frame is (H, W, 3) uint8, not {image.shape} {image.dtype}")
+        even = pad_to_even(image)
+        if self._shape is None:
+            self._shape = image.shape
+            self._stream.height, self._stream.width = even.shape[:2]
+        if image.shape != self._shape:
+            raise ValueError(f"frame of {image.shape} in a video of {self._shape}")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def _finish(self) -> None:
+        if self._shape is None:
+            raise ValueError(f"no frame was written to '{self.path}'")
+        self._container.mux(self._stream.encode(None))
+
+
+def pad_to_even(image: np.ndarray) -> np.ndarray:
+    """Repeat the last row or column of an image with an odd height or width."""
+    height, width = image.shape[:2]
+    return np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Join images of any sizes in a row, each scaled to the height of the first.
+
+    Returns:
+        (H, sum of widths, 3) uint8.
+    """
+    if not images:
+        raise ValueError("no image to put side by side")
+    height = images[0].shape[0]
+    row: list[np.ndarray] = []
+    for image in images:
+        if image.shape[0] != height:
+            width = max(1, round(image.shape[1] * height / image.shape[0]))
+            is_smaller = height < image.shape[0]
+            method = cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR
+            image = np.asarray(cv2.resize(image, (width, height), interpolation=method))
+        row.append(image)
+    return np.concatenate(row, axis=1)
+
+
+def draw_track(
+    image: np.ndarray,
+    points: np.ndarray,
+    colour: Colour = YELLOW,
+    *,
+    thickness: int = 2,
+    radius: int = 8,
+) -> np.ndarray:
+    """Draw where a point has been: a line that fades towards its past, a ring at its present.
+
+    Args:
+        image: (H, W, 3) uint8.
+        points: (N, 2) pixels, x right and y down, oldest first; rows that are NaN (not in view)
+            interrupt the line.
+        colour: RGB.
+        thickness: of the line, in pixels.
+        radius: of the ring, in pixels.
+
+    Returns:
+        A new image.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    # Far outside the picture a line is cut off unseen; OpenCV's fixed-point numbers overflow.
+    limit = 4 * max(image.shape)
+    valid = np.isfinite(points).all(axis=1) & (np.abs(points) < limit).all(axis=1)
+    fixed = np.round(np.where(valid[:, None], points, 0) * 16).astype(int)  # 1/16 pixel
+    opacity = np.zeros(image.shape[:2], dtype=np.uint8)
+    for index in range(1, len(points)):
+        if valid[index - 1] and valid[index]:
+            value = round(255 * (0.15 + 0.85 * index / (len(points) - 1)))
+            _add_line(opacity, fixed[index - 1], fixed[index], thickness, value)
+    drawn = _paint(image, opacity, colour)
+    if len(points) and valid[-1]:
+        centre = (int(fixed[-1][0]), int(fixed[-1][1]))
+        # The dark rim lies outside only: what is in the ring stays to be seen.
+        rim = radius * 16 + 8 * thickness + 8
+        cv2.circle(drawn, centre, rim, BLACK, 1, cv2.LINE_AA, shift=4)
+        cv2.circle(drawn, centre, radius * 16, colour, thickness, cv2.LINE_AA, shift=4)
+    return drawn
+
+
+def put_caption(image: np.ndarray, text: str) -> np.ndarray:
+    """Write one line at the lower left, white with a dark rim, sized to the image.
+
+    Returns:
+        A new image.
+    """
+    height, width = image.shape[:2]
+    scale = max(height / 700, 0.35)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    margin = round(12 * scale) + 4
+    text_width = cv2.getTextSize(text, font, scale, 1)[0][0]
+    if text_width > width - 2 * margin > 0:
+        scale *= (width - 2 * margin) / text_width
+    # The rim is grown from the letters: drawn thicker, letters of OpenCV 5 are also wider apart.
+    opacity = np.zeros((height, width), dtype=np.uint8)
+    cv2.putText(opacity, text, (margin, height - margin), font, scale, 255, 1, cv2.LINE_AA)
+    rim = np.asarray(cv2.dilate(opacity, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))))
+    return _paint(_paint(image, rim, BLACK), opacity, WHITE)
+
+
+def _paint(image: np.ndarray, opacity: np.ndarray, colour: Colour) -> np.ndarray:
+    """Lay a colour over an image, opacity (H, W) uint8 from 0 to 255."""
+    painted = image.copy()
+    touched = opacity > 0
+    weight = opacity[touched][:, None] / np.float32(255)
+    mixed = image[touched] * (1 - weight) + np.asarray(colour, dtype=np.float32) * weight
+    painted[touched] = np.round(mixed).astype(np.uint8)
+    return painted
+
+
+def _add_line(
+    opacity: np.ndarray, start: np.ndarray, end: np.ndarray, thickness: int, value: int
+) -> None:
+    """Raise ``opacity`` to ``value`` along a line given in 1/16 pixels; crossings do not add."""
+    height, width = opacity.shape
+    low = np.maximum(np.minimum(start, end) // 16 - thickness - 2, 0)
+    high = np.minimum(np.maximum(start, end) // 16 + thickness + 3, (width, height))
+    if (high <= low).any():
+        return
+    region = opacity[low[1] : high[1], low[0] : high[0]]
+    line = np.zeros_like(region)
+    shift = low * 16
+    first = (int(start[0] - shift[0]), int(start[1] - shift[1]))
+    last = (int(end[0] - shift[0]), int(end[1] - shift[1]))
+    cv2.line(line, first, last, value, thickness, cv2.LINE_AA, shift=4)
+    np.maximum(region, line, out=region)
+
+
+FRAME_STEPS = 2
+"""Control steps between two frames: 25 frames/s, half of what is simulated."""
+
+TRACK_STEPS = 100
+"""Control steps of the mouth's past that are drawn: 2 s."""
+
+VIEW_SIZE = (360, 480)
+"""Height and width of each camera's view in pixels: three of them fit a screen."""
+
+MULTISAMPLES = 4
+
+
+def write_preview(path: Path, episodes: Sequence[Path]) -> None:
+    """Write one H.264 video of some episodes, one after the other, with a progress bar.
+
+    Args:
+        path: of the video, ``....mp4``.
+        episodes: files.
+
+    Raises:
+        RequestError: an episode is damaged or of another model, or there is no OpenGL.
+    """
+    steps = [int(read_metadata(episode)["num_steps"]) for episode in episodes]
+    frames = sum(-(-count // FRAME_STEPS) for count in steps)
+    with (
+        VideoWriter(path, 1.0 / (FRAME_STEPS * CONTROL_PERIOD)) as video,
+        tqdm(total=frames, unit="frame", desc=path.name) as progress,
+    ):
+        for episode in episodes:
+            for frame in preview_frames(episode):
+                video.write(frame)
+                progress.update()
+
+
+def preview_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """Act an episode out and draw it; yield (H, 3 W, 3) uint8 frames."""
+    with (
+        EpisodeReader(path) as episode,
+        closing(
+            remake_env(
+                episode,
+                cameras=(),
+                image_size=VIEW_SIZE,
+                shadows=True,
+                multisamples=MULTISAMPLES,
+            )
+        ) as env,
+    ):
+        world = world_of(env)
+        mouth = episode.array("mouth_position")[:, 0]
+        names, phases = episode.attributes["phase_names"], episode.array("phase")
+        title = f"seed {episode.attributes['seed']}, {episode.attributes['expert']}"
+        for step in replay(env, episode):
+            if step % FRAME_STEPS:
+                continue
+            views = world.renderer.render(world.data, CAMERAS)
+            past = mouth[max(0, step - TRACK_STEPS) : step + 1]
+            drawn = [
+                draw_track(views[camera], project(world.model, world.data, camera, past, VIEW_SIZE))
+                for camera in CAMERAS
+            ]
+            seconds = step * CONTROL_PERIOD
+            drawn[0] = put_caption(drawn[0], f"{title}: {names[phases[step]]}, {seconds:.1f} s")
+            yield side_by_side(drawn)
+
+
+CYAN = (0, 229, 255)
+
+CLOSE_UP = "front_close"
+ZOOM = 3
+"""How much larger the fourth view shows the surroundings of the mouth."""
+
+HOLD_SECONDS = 1.0
+"""for which the last frame, with the outcome, stays."""
+
+
+def pick_for_video(results: Sequence[EpisodeResult], number: int) -> list[EpisodeResult]:
+    """Pick the first successes and the first failures by seed, half of each.
+
+    Where there are too few of one kind, the other fills up. Of an odd number, the larger half goes
+    to the successes.
+    """
+    ordered = sorted(results, key=lambda result: result.seed)
+    good = [result for result in ordered if result.is_success]
+    bad = [result for result in ordered if not result.is_success]
+    of_good = max(number - number // 2, number - len(bad))
+    picked = good[:of_good]
+    return picked + bad[: number - len(picked)]
+
+
+def video_name(result: EpisodeResult) -> str:
+    """Name the video of an episode."""
+    return f"seed_{result.seed:06d}_{result.failure or 'success'}.mp4"
+
+
+def write_video(path: Path, task: Task, result: EpisodeResult, recording: Recording) -> None:
+    """Write an H.264 video of an episode.
+
+    Raises:
+        RequestError: there is no OpenGL.
+        RuntimeError: the episode, acted out again, ends otherwise than recorded.
+    """
+    last = len(recording.actions) - 1
+    frames = last // FRAME_STEPS + 1 + (last % FRAME_STEPS > 0)
+    frame = None
+    with VideoWriter(path, 1.0 / (FRAME_STEPS * CONTROL_PERIOD)) as video:
+        drawn = video_frames(task, result, recording)
+        for frame in tqdm(drawn, total=frames, unit="frame", desc=path.name, mininterval=1.0):
+            video.write(frame)
+        if frame is not None:
+            for _ in range(round(HOLD_SECONDS / (FRAME_STEPS * CONTROL_PERIOD))):
+                video.write(frame)
+
+
+def video_frames(
+    task: Task, result: EpisodeResult, recording: Recording
+) -> Iterator[NDArray[np.uint8]]:
+    """Act an episode out and draw it; yield (H, W, 3) uint8 frames.
+
+    The three cameras stand side by side, then the surroundings of the mouth, enlarged. Yellow is
+    where the mouth truly is and has been; cyan is where the policy was told that it is and will be.
+    """
+    title = f"{result.policy} {result.arm}, seed {result.seed}".strip()
+    look = {"image_size": VIEW_SIZE, "shadows": True, "multisamples": MULTISAMPLES}
+    with closing(task.make(**look)) as env:
+        world = world_of(env)
+        _, info = env.reset(seed=result.seed)
+        mouths: list[NDArray[np.float64]] = []
+        last = len(recording.actions) - 1
+        for step, (vector, action) in enumerate(
+            zip(recording.vectors, recording.actions, strict=True)
+        ):
+            mouths = [*mouths[-TRACK_STEPS:], world.mouth_track[0]]
+            if step % FRAME_STEPS == 0 or step == last:
+                told = told_mouths(task.spec, vector)
+                caption = f"{title}: {info['phase']}, {step * CONTROL_PERIOD:.1f} s"
+                if step == last:
+                    caption += f"  {result.failure.replace('_', ' ') or 'SUCCESS'}"
+                yield _draw(world, np.array(mouths), told, caption)
+            _, _, _, _, info = env.step(action)
+        if bool(info["is_success"]) != result.is_success:
+            raise RuntimeError(f"seed {result.seed} ends otherwise than recorded")
+
+
+def told_mouths(spec: ObservationSpec, vector: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the mouth positions in a vector (S,), (F, 3) m, world; F is 0 if it shows none."""
+    parts = split_vector(spec, vector)
+    if "mouth" in parts:
+        return parts["mouth"][None, :3].astype(np.float64)
+    if "prediction" in parts:
+        return parts["prediction"][: 4 * spec.frames].reshape(-1, 4)[:, 1:].astype(np.float64)
+    return np.empty((0, 3))
+
+
+def _draw(
+    world: FaceEnv, mouths: NDArray[np.float64], told: NDArray[np.float64], caption: str
+) -> NDArray[np.uint8]:
+    views = world.renderer.render(world.data, CAMERAS)
+
+    def pixels(camera: str, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return project(world.model, world.data, camera, points, VIEW_SIZE)
+
+    close = _zoom(
+        views[CLOSE_UP],
+        pixels(CLOSE_UP, mouths[-1]),
+        pixels(CLOSE_UP, mouths),
+        pixels(CLOSE_UP, told),
+    )
+    drawn = [
+        _dots(draw_track(views[camera], pixels(camera, mouths)), pixels(camera, told), 2)
+        for camera in CAMERAS
+    ]
+    drawn[0] = put_caption(drawn[0], caption)
+    return side_by_side([*drawn, close])
+
+
+def _zoom(
+    image: NDArray[np.uint8],
+    centre: NDArray[np.float64],
+    track: NDArray[np.float64],
+    told: NDArray[np.float64],
+) -> NDArray[np.uint8]:
+    """Enlarge what is around ``centre`` to the size of the image, and draw into that."""
+    height, width = image.shape[:2]
+    size = np.array([width, height]) / ZOOM
+    low = np.clip(np.nan_to_num(centre) - size / 2, 0, np.array([width, height]) - size).round()
+    column, row = low.astype(int)
+    part = image[row : row + round(size[1]), column : column + round(size[0])]
+    large = np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC))
+    ringed = draw_track(large, (track - low) * ZOOM, radius=16)
+    return _dots(ringed, (told - low) * ZOOM, 5)
+
+
+def _dots(image: NDArray[np.uint8], points: NDArray[np.float64], radius: int) -> NDArray[np.uint8]:
+    """Draw dots joined by a line; the first, which is about the present, has a dark rim."""
+    drawn = image.copy()
+    limit = 4 * max(image.shape)
+    seen = points[(np.abs(points) < limit).all(axis=1)]  # NaN is not less
+    fixed = np.round(seen * 16).astype(np.int32)  # 1/16 pixel
+    cv2.polylines(drawn, [fixed.reshape(-1, 1, 2)], False, CYAN, 1, cv2.LINE_AA, shift=4)
+    for number, (x, y) in enumerate(fixed.tolist()):
+        if number == 0:
+            cv2.circle(drawn, (x, y), (radius + 1) * 16, (0, 0, 0), -1, cv2.LINE_AA, shift=4)
+        cv2.circle(drawn, (x, y), radius * 16, CYAN, -1, cv2.LINE_AA, shift=4)
+    return drawn

@@ -1,0 +1,231 @@
+"""What training says of itself: means over some steps, ``metrics.jsonl``, TensorBoard, wandb.
+
+A line of ``metrics.jsonl`` is a JSON object with ``kind``: ``train`` (means over the steps since
+the last such line) or ``validation``, and ``step``, the number of steps done.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from robo_manip_baselines.data.files import atomic_file
+from robo_manip_baselines.runs.errors import RequestError, require_choice
+
+LOGGERS = ("tensorboard", "wandb", "none")
+
+
+class RunningMean:
+    """Means of scalars that stay on the device until they are asked for.
+
+    Attributes:
+        names: of the scalars; none before the first step.
+        count: steps that are summed.
+        sums: () or (n,) float64, on the device.
+    """
+
+    def __init__(self) -> None:
+        self.names: tuple[str, ...] = ()
+        self.count = 0
+        self.sums: Tensor | None = None
+
+    def add(self, metrics: Mapping[str, Tensor]) -> None:
+        """Take in the scalars of a step."""
+        values = torch.stack([value.double() for value in metrics.values()])
+        if self.sums is None:
+            self.names, self.sums = tuple(metrics), values
+        else:
+            self.sums += values
+        self.count += 1
+
+    def means(self) -> Tensor:
+        """Return the means, (n,) float64, still on the device; nothing is reset."""
+        assert self.sums is not None, "no step yet"
+        return self.sums / self.count
+
+    def reset(self) -> None:
+        """Start anew."""
+        self.sums, self.count = None, 0
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Read ``metrics.jsonl``; a last line that was cut off is left out."""
+    lines: list[dict[str, Any]] = []
+    if path.is_file():
+        for text in path.read_text(encoding="utf-8").splitlines():
+            try:
+                lines.append(json.loads(text))
+            except ValueError:
+                break
+    return lines
+
+
+def truncate_metrics(path: Path, step: int) -> None:
+    """Drop what was written after a step, so that going on from there writes it once."""
+    kept = [line for line in read_metrics(path) if line["step"] <= step]
+    with atomic_file(path) as temporary:
+        temporary.write_text("".join(f"{_to_line(line)}\n" for line in kept), encoding="utf-8")
+
+
+class Board(Protocol):
+    """Where scalars are shown beside the file."""
+
+    def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
+        """Show a number."""
+        ...
+
+    def close(self) -> None:
+        """Write out what is left."""
+        ...
+
+
+class MetricsLog:
+    """Appends lines to ``metrics.jsonl`` and shows their numbers on a board.
+
+    Args:
+        path: of the file; lines of steps after ``step`` are dropped.
+        step: that training goes on from.
+        board: as `open_board` makes it.
+    """
+
+    def __init__(self, path: Path, step: int, board: Board | None) -> None:
+        truncate_metrics(path, step)
+        self._file = path.open("a", encoding="utf-8")
+        self._board = board
+
+    def write(self, kind: str, step: int, values: Mapping[str, float]) -> None:
+        """Write a line, at once."""
+        # JSON has no NaN: a number that is none is left out.
+        finite = {name: value for name, value in values.items() if math.isfinite(value)}
+        self._file.write(_to_line({"kind": kind, "step": step, **finite}) + "\n")
+        self._file.flush()
+        if self._board:
+            for name, value in finite.items():
+                self._board.add_scalar(f"{kind}/{name}", value, step)
+
+    def __enter__(self) -> MetricsLog:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close file and board."""
+        self._file.close()
+        if self._board:
+            self._board.close()
+
+
+def open_board(logger: str, folder: Path, step: int, config: Mapping[str, Any]) -> Board | None:
+    """Open TensorBoard or wandb, or nothing.
+
+    Args:
+        logger: one of ``LOGGERS``.
+        folder: of the run.
+        step: that training goes on from; what TensorBoard has of later steps is hidden.
+        config: of the run, for wandb.
+
+    Raises:
+        RequestError: the logger is unknown or not installed.
+    """
+    require_choice("logger", logger, LOGGERS)
+    if logger == "none":
+        return None
+    try:
+        if logger == "tensorboard":
+            from torch.utils.tensorboard import SummaryWriter
+
+            return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
+        return _Wandb(folder, config)
+    except ImportError as error:
+        raise RequestError(
+            f"{logger} is not installed: pip install {logger}, or say --logger none"
+        ) from error
+
+
+class _Wandb:
+    """wandb behind the same two calls; a resumed run goes on under its own name."""
+
+    def __init__(self, folder: Path, config: Mapping[str, Any]) -> None:
+        import wandb  # pyright: ignore[reportMissingImports]
+
+        self._run = wandb.init(
+            project="robo_manip_baselines",
+            id=folder.resolve().name,
+            dir=str(folder),
+            config=dict(config),
+            resume="allow",
+        )
+
+    def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
+        """Show a number."""
+        self._run.log({tag: scalar_value}, step=global_step)
+
+    def close(self) -> None:
+        """Write out what is left."""
+        self._run.finish()
+
+
+def _to_line(values: Mapping[str, Any]) -> str:
+    rounded = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in values.items()}
+    return json.dumps(rounded, allow_nan=False)
+
+
+def write_curves(path: Path, lines: Sequence[dict[str, Any]], title: str) -> bool:
+    """Draw the losses of ``metrics.jsonl`` over the steps, on a logarithmic scale.
+
+    Args:
+        path: of the PNG.
+        lines: as `read_metrics` gives them.
+        title: above the picture.
+
+    Returns:
+        Whether it was drawn: matplotlib may not be installed, and there may be nothing to draw.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        return False
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache
+    by_kind = {kind: [x for x in lines if x["kind"] == kind] for kind in ("train", "validation")}
+    train, validation = by_kind["train"], by_kind["validation"]
+    if not train:
+        return False
+    other = ("kind", "step", "epoch", "learning_rate", "grad_norm", "seconds")
+    # A policy whose loss has one part calls it twice.
+    parts = [n for n in train[-1] if n not in other and not n.startswith("seconds_")]
+    if len(parts) == 2 and all(line[parts[0]] == line.get(parts[1]) for line in train):
+        parts.pop()
+    figure = Figure(figsize=(4.5 * len(parts), 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    for place, name in enumerate(parts):
+        axes = figure.add_subplot(1, len(parts), place + 1)
+        for kind, marker in (("train", ""), ("validation", "o")):
+            points = [(x["step"], x[name]) for x in by_kind[kind] if x.get(name, 0.0) > 0.0]
+            if points:
+                label = "training" if kind == "train" else "held out"
+                axes.plot(*zip(*points, strict=True), marker=marker, markersize=3, label=label)
+        axes.set_yscale("log")
+        axes.set_xlabel("step")
+        axes.set_ylabel(name)
+        axes.grid(True, which="both", alpha=0.3)
+        if place == 0 and validation:
+            axes.legend()
+    figure.suptitle(title)
+    with atomic_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=120)
+    return True

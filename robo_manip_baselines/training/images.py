@@ -1,0 +1,201 @@
+"""Images of any steps of the demonstrations, held in memory or decoded when they are asked for.
+
+Legend: R steps of all demonstrations together, b steps asked for, N cameras, H and W image height
+and width.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from robo_manip_baselines.data.demonstrations import Demonstrations
+from robo_manip_baselines.data.episode import EpisodeFileError, EpisodeReader, decode_image
+from robo_manip_baselines.runs.errors import RequestError
+
+Images = NDArray[np.uint8]
+
+MAX_OPEN_FILES = 256
+"""Episode files open at a time; the usual limit of a process is 1024 files of all kinds."""
+
+UNKNOWN_MEMORY = 4 * 2**30
+"""Bytes taken to be free where the system does not say."""
+
+
+class FrameSource:
+    """Gives the images of steps, in the order of ``spec.cameras``, at the size ``spec.image_size``.
+
+    Images that fit into ``memory_budget`` are decoded once and held. Otherwise each is read from
+    its file, which stays open, and decoded when it is asked for. A pool of threads does the
+    decoding. The pixels are the same either way, and each picture is checked against its checksum
+    when it is read.
+
+    May be used from several threads. Use as a context manager, or call `close`.
+
+    Args:
+        demonstrations: with at least one camera in their ``spec``.
+        memory_budget: bytes that images may take; half of what is free if None. Processes on one
+            machine each hold their own: divide what there is among them.
+        threads: that decode; one for each processor if None.
+
+    Attributes:
+        shape: (N, H, W, 3).
+        held: (R, N, H, W, 3) uint8 if all images are held, otherwise None.
+
+    Raises:
+        RequestError: there is no camera to show.
+        EpisodeFileError: a picture that is to be held is damaged.
+    """
+
+    def __init__(
+        self,
+        demonstrations: Demonstrations,
+        *,
+        memory_budget: int | None = None,
+        threads: int | None = None,
+    ) -> None:
+        spec = demonstrations.spec
+        if not spec.cameras:
+            raise RequestError("no images without a camera; choose --cameras")
+        self.shape = (len(spec.cameras), *spec.image_size, 3)
+        self.held: Images | None = None
+        self._cameras = spec.cameras
+        self._paths = demonstrations.paths
+        self._offsets = demonstrations.offsets
+        self._open: OrderedDict[int, EpisodeReader] = OrderedDict()
+        self._reading = threading.Lock()
+        self._pool = ThreadPoolExecutor(threads or processors(), thread_name_prefix="images")
+        shape = (int(self._offsets[-1]), *self.shape)
+        budget = free_memory() // 2 if memory_budget is None else memory_budget
+        if int(np.prod(shape)) <= budget:
+            try:
+                self.held = self._decode_all(np.empty(shape, np.uint8))
+            except BaseException:
+                self.close()
+                raise
+
+    def __enter__(self) -> FrameSource:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def images(self, rows: NDArray[np.int64], out: Images | None = None) -> Images:
+        """Return the images (b, N, H, W, 3) of (b,) steps.
+
+        Args:
+            rows: places among the R steps of the demonstrations.
+            out: where to write them, if given.
+
+        Raises:
+            IndexError: there is no such step.
+            EpisodeFileError: a picture is damaged; names file, camera and step.
+        """
+        if len(rows) and not 0 <= rows.min() <= rows.max() < self._offsets[-1]:
+            raise IndexError(f"rows 0 to {self._offsets[-1] - 1}, not {rows.min()} to {rows.max()}")
+        pictures: Images = np.empty((len(rows), *self.shape), np.uint8) if out is None else out
+        if self.held is not None:
+            # Unlike indexing, and unlike the mode "raise", this lets other threads run meanwhile.
+            np.take(self.held, rows, axis=0, out=pictures, mode="clip")
+            return pictures
+        episodes = np.searchsorted(self._offsets, rows, side="right") - 1
+        jobs = []
+        for place, (row, episode) in enumerate(zip(rows, episodes, strict=True)):
+            step = int(row - self._offsets[episode])
+            for index, camera in enumerate(self._cameras):
+                with self._reading:  # HDF5 itself reads one thing at a time
+                    data = self._reader(int(episode)).encoded_frame(camera, step)
+                job = (data, pictures[place, index], self._paths[episode], camera, step)
+                jobs.append(self._pool.submit(_decode, *job))
+        for job in jobs:
+            job.result()
+        return pictures
+
+    def close(self) -> None:
+        """Close the files and end the threads; may be called again."""
+        self._pool.shutdown(cancel_futures=True)
+        with self._reading:
+            while self._open:
+                self._open.popitem()[1].close()
+
+    def _reader(self, episode: int) -> EpisodeReader:
+        """Return the open file of an episode; the one unused for longest is closed if need be."""
+        if episode not in self._open:
+            if len(self._open) >= MAX_OPEN_FILES:
+                self._open.popitem(last=False)[1].close()
+            self._open[episode] = EpisodeReader(self._paths[episode])
+        self._open.move_to_end(episode)
+        return self._open[episode]
+
+    def _decode_all(self, held: Images) -> Images:
+        """Fill ``held`` with every image, an episode to each thread."""
+
+        def decode_episode(index: int) -> None:
+            with EpisodeReader(self._paths[index]) as episode:
+                for step in range(len(episode)):
+                    pictures = held[self._offsets[index] + step]
+                    for camera, picture in zip(self._cameras, pictures, strict=True):
+                        data = episode.encoded_frame(camera, step)
+                        _decode(data, picture, episode.path, camera, step)
+
+        numbers = range(len(self._paths))
+        done = self._pool.map(decode_episode, numbers)
+        for _ in tqdm(done, "decoding images", len(numbers), unit="episode", disable=None):
+            pass
+        return held
+
+
+def fit_image(image: Images, size: tuple[int, int]) -> Images:
+    """Shrink an (H, W, 3) image to ``size``, height and width, each pixel the mean of its area.
+
+    An image of that size already is returned as it is.
+    """
+    if image.shape[:2] == tuple(size):
+        return image
+    small = cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.uint8)
+
+
+def free_memory() -> int:
+    """Return the bytes of memory that are free, or that the container has left, if that is less."""
+    free = [UNKNOWN_MEMORY]
+    with suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        free = [next(1024 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable:"))]
+    with suppress(OSError, ValueError):  # "max", no number, where there is no limit
+        limit, used = (
+            int(Path(f"/sys/fs/cgroup/memory.{name}").read_text(encoding="ascii"))
+            for name in ("max", "current")
+        )
+        free.append(max(limit - used, 0))
+    return min(free)
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _decode(data: Images, out: Images, path: Path, camera: str, step: int) -> None:
+    """Write the decoded picture to ``out``, (H, W, 3)."""
+    try:
+        out[:] = fit_image(decode_image(data), (out.shape[0], out.shape[1]))
+    except ValueError as error:
+        raise EpisodeFileError(f"'{path}': frame {step} of '{camera}': {error}") from error
