@@ -6,7 +6,7 @@ needs neither MediaPipe, nor OpenGL, nor a display, nor a GPU.
 
 from __future__ import annotations
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.tracks import FaceTrack, load_track, save_track
+from robo_manip_baselines.runs.errors import RequestError
 
 __all__ = ["FaceTrack", "RequestError", "load_track", "save_track"]

@@ -28,10 +28,10 @@ from face_prediction.dataset.manifest import (
 )
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.settings import CropFrom, SequenceSettings, kind_of
-from face_prediction.errors import RequestError
 from face_prediction.motion.library import Attribution, read_attributions
 from face_prediction.tracking.tracks import load_track
 from face_prediction.tracking.video import FrameBar
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

@@ -22,8 +22,8 @@ from face_prediction.commands.extract import ExtractOptions, run_extract
 from face_prediction.commands.live import LiveOptions, run_live
 from face_prediction.commands.predict import PredictOptions, run_predict
 from face_prediction.commands.train import run_train
-from face_prediction.errors import RequestError
 from face_prediction.training.options import TrainOptions
+from robo_manip_baselines.runs.errors import RequestError
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _FRAME = re.compile(r"^[\s│|╭╰─+-]+|[\s│|╮╯─+-]+$")

@@ -15,7 +15,6 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.settings import KINDS
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.scoring import Verdict, judge, judge_exchanged, steps
 from face_prediction.evaluation.setup import (
     LineUp,
@@ -37,6 +36,7 @@ from face_prediction.evaluation.video import draw_pictures, draw_plots, draw_vid
 from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
 from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

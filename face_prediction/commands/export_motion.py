@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import tyro
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.library import (
     SCHEMA,
     VERSION,
@@ -23,9 +22,10 @@ from face_prediction.motion.library import (
 )
 from face_prediction.motion.motion import ClipMotion, MotionSettings, QualityLimits, lift
 from face_prediction.motion.report import clip_row, read_page, write_report
-from face_prediction.npz_file import read_npz
 from face_prediction.tracking.lifting import VERTICAL_FOV_DEGREES
 from face_prediction.tracking.tracks import load_track
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.npz import read_npz
 
 logger = logging.getLogger(__name__)
 

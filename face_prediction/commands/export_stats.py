@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from face_prediction.dataset.manifest import SequenceRow
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.evaluation import (
     PAPER_CAMERA,
     Camera,
@@ -39,6 +38,7 @@ from face_prediction.evaluation.setup import CrossFit, batch_size, cross_fit
 from face_prediction.motion.library import load_library
 from face_prediction.prediction.interface import PictureNeeds
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

@@ -19,7 +19,6 @@ import numpy as np
 import tyro
 
 from face_prediction.commands.export_motion import attribution_of, track_files
-from face_prediction.errors import RequestError
 from face_prediction.motion.library import Attribution, read_attributions
 from face_prediction.motion.surface import (
     JawFit,
@@ -32,8 +31,9 @@ from face_prediction.motion.surface import (
     opening_velocity,
     symmetric,
 )
-from face_prediction.npz_file import write_npz
 from face_prediction.tracking.tracks import FaceTrack, load_track
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.npz import write_npz
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import tyro
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.detector import (
     DetectorSettings,
     FaceDetector,
@@ -20,6 +19,7 @@ from face_prediction.tracking.detector import (
 from face_prediction.tracking.extract import ExtractSettings, extract_track, is_up_to_date
 from face_prediction.tracking.tracks import save_track
 from face_prediction.tracking.video import FrameBar, require_video, sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

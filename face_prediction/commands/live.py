@@ -13,7 +13,6 @@ import numpy as np
 
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.setup import BaselinePredictor
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
 from face_prediction.live.loop import Summary, run_loop
@@ -28,6 +27,7 @@ from face_prediction.live.streaming import (
 from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoFrame, VideoReader, require_video
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

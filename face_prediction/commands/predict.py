@@ -29,7 +29,6 @@ from face_prediction.dataset.manifest import MANIFEST_NAME, Manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import ClipFrames, clip_frames
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.setup import batch_size, cross_fit
 from face_prediction.motion.library import (
     Attribution,
@@ -50,6 +49,7 @@ from face_prediction.prediction.predicted_motion import (
 )
 from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 #: m: two liftings of one track agree to this; a library holds float32.
 _SAME_PLACE = 1e-5

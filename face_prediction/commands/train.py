@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from face_prediction.errors import RequestError
 from face_prediction.training.options import TrainOptions
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def run_train(options: TrainOptions) -> int:

@@ -29,9 +29,9 @@ from face_prediction.dataset.sequences import (
     find_sequences,
 )
 from face_prediction.dataset.settings import KINDS, SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import VideoFrame, VideoReader, sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 #: Two clocks of one video agree to this many seconds; they are read from the same file.
 SAME_CLOCK = 1e-6

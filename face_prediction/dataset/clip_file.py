@@ -14,8 +14,8 @@ import numpy as np
 
 from face_prediction.dataset.manifest import FACTS
 from face_prediction.dataset.sequences import ClipFrames, Sequences
-from face_prediction.errors import RequestError
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 #: Sizes that JPEG can be decoded at without first decoding the whole picture: 1 / these.
 REDUCTIONS = (1, 2, 4, 8)
@@ -121,7 +121,7 @@ def write_clip(
         record: JSON that says what the file was made from and how; see `build.clip_record`.
     """
     sizes = [len(data) for data in pictures.encoded]
-    with whole_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
+    with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
         file.attrs["schema"] = SCHEMA
         file.attrs["version"] = VERSION
         file.attrs["record"] = json.dumps(dict(record), sort_keys=True)

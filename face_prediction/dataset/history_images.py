@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from face_prediction.dataset.build import SAME_CLOCK
 from face_prediction.dataset.clip_file import decode_picture, encode_picture
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.batches import reduction
 from face_prediction.prediction.interface import PictureNeeds
 from face_prediction.prediction.predicted_motion import Origin
 from face_prediction.tracking.crop import Crop
 from face_prediction.tracking.tracks import FaceTrack
 from face_prediction.tracking.video import VideoReader
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def dataset_picture(

@@ -14,10 +14,10 @@ import numpy as np
 
 from face_prediction.dataset.sequences import ClipFrames, Sequences
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.tracking.crop import Crop
 from face_prediction.tracking.lifting import LIPS
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 #: What the share of all footage counts beside that of a person's own kinds. Little: kinds are
 #: reported apart and every fold is chosen by once, so that each should hold some of every kind;
@@ -169,7 +169,7 @@ class Manifest:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write ``dataset.json``, whole or not at all."""
-    with whole_file(folder / MANIFEST_NAME) as temporary:
+    with atomic_file(folder / MANIFEST_NAME) as temporary:
         text = json.dumps(manifest.to_json(), indent=1, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -247,7 +247,7 @@ class SequenceRow:
 def write_table(folder: Path, rows: Sequence[SequenceRow]) -> None:
     """Write ``sequences.csv``, whole or not at all."""
     with (
-        whole_file(folder / TABLE_NAME) as temporary,
+        atomic_file(folder / TABLE_NAME) as temporary,
         temporary.open("w", encoding="utf-8", newline="") as stream,
     ):
         table = csv.writer(stream, lineterminator="\n")

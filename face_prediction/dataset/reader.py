@@ -34,8 +34,8 @@ from face_prediction.dataset.manifest import (
     fold_split,
     read_manifest,
 )
-from face_prediction.errors import RequestError
 from face_prediction.tracking.crop import Crop
+from robo_manip_baselines.runs.errors import RequestError
 
 #: Clip files kept open at once; a process may open some thousand.
 MAX_OPEN = 64

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.motion.motion import Quality, assess, has_constant_rate
 from face_prediction.tracking.crop import Crop, crop_around
 from face_prediction.tracking.extract import SAME_TIME, Samples, resample
 from face_prediction.tracking.geometry import quaternion_from_matrix, rigid_head_poses
 from face_prediction.tracking.lifting import jaw_openings, mouth_centres
 from face_prediction.tracking.tracks import FaceTrack
+from robo_manip_baselines.runs.errors import RequestError
 
 #: Why a sequence is dropped; the first that holds is counted.
 REASONS: tuple[str, ...] = ("no_face", "jump", "spike")

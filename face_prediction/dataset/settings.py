@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.library import Attribution
 from face_prediction.motion.motion import QualityLimits
+from robo_manip_baselines.runs.errors import RequestError
 
 CropFrom = Literal["history", "sequence"]
 

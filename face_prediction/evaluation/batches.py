@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from face_prediction.dataset.clip_file import REDUCTIONS
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.prediction.interface import Forecast, PictureNeeds, Predictor
 from face_prediction.tracking.detector import FaceDetection
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 Floats = NDArray[np.float64]
 

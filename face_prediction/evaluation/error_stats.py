@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.errors import Floats, has_forecast, mouth_errors
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 #: What `Camera.metres` computes, as it stands in every file of error statistics.
 EQUATIONS = (
@@ -257,7 +257,7 @@ def save_error_stats(path: Path, stats: ErrorStats) -> None:
     # numbers of one innermost list side by side: shorter, and readable. In JSON only the layout
     # has line breaks, so no text is touched.
     text = re.sub(r"\[\n\s*([-+0-9.eE,\s]+?)\n\s*\]", lambda m: f"[{' '.join(m[1].split())}]", text)
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

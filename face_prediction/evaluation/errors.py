@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast.interface import mouth_centre
+from robo_manip_baselines.runs.errors import RequestError
 
 #: The outer corners of the eyes (the subject's right and left) in MediaPipe's face mesh: the
 #: normaliser of the 300-W benchmark (Sagonas et al. 2013).

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.calibration import LEVELS
 from face_prediction.evaluation.statistics import KindSummary
 from face_prediction.tracking.lifting import LIPS
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 #: Colours that colour-blind readers can tell apart (Okabe and Ito), for networks.
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -48,7 +48,7 @@ def save_png(figure: Any, path: Path) -> None:
     Raises:
         RequestError: the folder cannot be written to.
     """
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         # without the name of the program: it would change with matplotlib's version
         figure.savefig(temporary, format="png", metadata={"Software": None})
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from face_prediction.dataset.clip_file import open_clip, read_array, read_record
 from face_prediction.dataset.manifest import CLIP_FOLDER
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.evaluation import Camera, ErrorStats
 from face_prediction.evaluation.error_stats import ResidualRun
 from face_prediction.motion.library import MotionLibrary
 from face_prediction.tracking.lifting import VERTICAL_FOV_DEGREES
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def crop_spans(dataset: FaceDataset, clips: Iterable[str]) -> NDArray[np.float64]:

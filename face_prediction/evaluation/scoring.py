@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.batches import Batch, PicturePlan, find_landmarks
 from face_prediction.evaluation.calibration import interval_levels
 from face_prediction.evaluation.errors import (
@@ -26,6 +25,7 @@ from face_prediction.evaluation.errors import (
 from face_prediction.evaluation.setup import Contestant, LineUp, Role, Selection
 from face_prediction.prediction.interface import Forecast, Predictor
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.errors import RequestError
 
 Floats = NDArray[np.float64]
 

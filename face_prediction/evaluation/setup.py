@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.batches import (
     Batch,
     DetectedPredictor,
@@ -29,6 +28,7 @@ from face_prediction.evaluation.batches import (
 from face_prediction.forecast import FORECASTERS, Forecaster, LandmarkSequences, fit_forecaster
 from face_prediction.prediction.interface import Forecast, PictureNeeds, Predictor
 from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.calibration import covered
 from face_prediction.evaluation.errors import mouth_distances
 from face_prediction.evaluation.scoring import Judged, Verdict
 from face_prediction.evaluation.setup import PERSISTENCE, Role
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import numpy as np
 from face_prediction.evaluation.calibration import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, Estimate, KindSummary
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.files import atomic_file
 
 
 @dataclass(frozen=True)
@@ -337,7 +337,7 @@ def write_results(folder: Path, evaluation: Evaluation) -> None:
         ("table2.csv", table_2_csv(evaluation)),
         ("results.json", results_json(evaluation)),
     ):
-        with whole_file(folder / name) as temporary:
+        with atomic_file(folder / name) as temporary:
             temporary.write_text(text, encoding="utf-8", newline="\n")
 
 

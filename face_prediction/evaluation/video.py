@@ -32,7 +32,7 @@ from face_prediction.evaluation.setup import PERSISTENCE, LineUp
 from face_prediction.evaluation.statistics import KindSummary
 from face_prediction.forecast.interface import mouth_centre
 from face_prediction.tracking.crop import Crop
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.files import atomic_file
 
 
 def write_h264(path: Path, images: Iterable[np.ndarray], fps: float, crf: int = 20) -> None:
@@ -47,7 +47,7 @@ def write_h264(path: Path, images: Iterable[np.ndarray], fps: float, crf: int = 
     import av  # not needed to make tables
 
     with (
-        whole_file(path) as temporary,
+        atomic_file(path) as temporary,
         # the index goes to the front, so that a browser starts to play before all has arrived
         av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container,
     ):

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast.interface import (
     Array,
     Forecaster,
@@ -25,6 +24,7 @@ from face_prediction.forecast.interface import (
     subject_folds,
 )
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.errors import RequestError
 
 if TYPE_CHECKING:
     from typing_extensions import Self

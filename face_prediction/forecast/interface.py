@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.lifting import LIPS
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.errors import RequestError
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences, mouth_centre
+from robo_manip_baselines.runs.errors import RequestError
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -7,11 +7,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast.autoregression import LandmarkAutoregression, MouthAutoregression
 from face_prediction.forecast.interface import Forecaster, LandmarkSequences
 from face_prediction.forecast.kalman import KalmanConstantVelocity
 from face_prediction.forecast.simple import ConstantVelocity, Line, Persistence
+from robo_manip_baselines.runs.errors import RequestError
 
 FORECASTERS: dict[str, type[Forecaster]] = {
     kind.name: kind

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences
+from robo_manip_baselines.runs.errors import RequestError
 
 if TYPE_CHECKING:
     from typing_extensions import Self

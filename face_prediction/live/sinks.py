@@ -18,11 +18,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast import mouth_centre
 from face_prediction.tracking.crop import Crop
 from face_prediction.tracking.lifting import LIPS
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 #: Ticks a second of the times in a file: 1/90000 s, as cameras and broadcasts have it.
 _CLOCK = 90_000
@@ -60,7 +60,7 @@ class VideoFile:
     def __enter__(self) -> VideoFile:
         import av
 
-        temporary = self._stack.enter_context(whole_file(self._path))
+        temporary = self._stack.enter_context(atomic_file(self._path))
         # the index in front, so that a browser starts to play before all has arrived
         self._container = self._stack.enter_context(
             av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"})

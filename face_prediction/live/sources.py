@@ -12,11 +12,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, native_stderr_silenced
 from face_prediction.tracking.extract import FaceFollower, ZoomingDetector
 from face_prediction.tracking.geometry import read_canonical_face
 from face_prediction.tracking.video import VideoFrame, VideoReader
+from robo_manip_baselines.runs.errors import RequestError
 
 #: Seconds that a camera may take to give an image before it counts as gone.
 CAMERA_TIMEOUT = 5.0

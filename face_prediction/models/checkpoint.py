@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from face_prediction.errors import RequestError
 from face_prediction.models.interface import PredictorModel
 from face_prediction.models.settings import make_model, settings_class
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> str:
@@ -33,7 +33,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], record: Mapping[str
     digest = tensor_hash(plain)
     # one entry: safetensors writes several in any order, and equal networks shall be equal files
     metadata = {"record": json.dumps({**record, "sha256": digest})}
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(safetensors.save(plain, metadata))
     return digest
 
@@ -141,7 +141,7 @@ def save_checkpoint(folder: Path, record: CheckpointRecord, state: Mapping[str, 
     kind = {"schema": SCHEMA, "version": VERSION}
     digest = write_tensors(folder / MODEL_FILE, state, kind)
     data = {**kind, **asdict(record), "model_sha256": digest}
-    with whole_file(folder / CONFIG_FILE) as temporary:
+    with atomic_file(folder / CONFIG_FILE) as temporary:
         text = json.dumps(data, indent=1, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")
 

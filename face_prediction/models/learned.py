@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from face_prediction.errors import RequestError
 from face_prediction.models.checkpoint import CheckpointRecord, load_model
 from face_prediction.models.interface import History, Output, PredictorModel
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.errors import RequestError
 
 
 class LearnedPredictor:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from face_prediction.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 if TYPE_CHECKING:
     from typing_extensions import Self

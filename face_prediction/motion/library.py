@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.motion import ClipMotion
-from face_prediction.npz_file import Arrays, read_npz, require_array, write_npz
 from face_prediction.tracking.geometry import continuous_quaternions
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.npz import Arrays, read_npz, require_array, write_npz
 
 COLUMNS = ("clip", "subject", "ship", "licence", "source")
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.geometry import (
     continuous_quaternions,
     quaternion_from_matrix,
@@ -21,6 +20,7 @@ from face_prediction.tracking.geometry import (
 )
 from face_prediction.tracking.lifting import jaw_openings, mouth_centres
 from face_prediction.tracking.tracks import FaceTrack
+from robo_manip_baselines.runs.errors import RequestError
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 #: Standard deviation of a normal distribution in units of its median absolute deviation.

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.library import MotionLibrary
 from face_prediction.motion.motion import ClipMotion, step_tremor
 from face_prediction.tracking.geometry import matrix_from_quaternion, rotation_angle
+from robo_manip_baselines.runs.errors import RequestError
 
 #: The three axes, in colours that colour-blind readers can tell apart (Okabe and Ito).
 AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")

@@ -17,9 +17,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from face_prediction.errors import NoFaceError, RequestError
 from face_prediction.tracking.detector import DetectorSettings, FaceDetection, FaceDetector
 from face_prediction.tracking.geometry import (
     CanonicalFace,
@@ -24,8 +23,9 @@ from face_prediction.tracking.geometry import (
     slerp,
 )
 from face_prediction.tracking.lifting import jaw_openings
-from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, load_track
+from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, load_track
 from face_prediction.tracking.video import VideoFrame, VideoReader, sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 #: Two decoded frames further apart than this are a gap: at 0.1 s a mouth at the median speed
 #: (1-4 cm/s) has gone 4 mm, and nothing says which way.

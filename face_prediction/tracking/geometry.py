@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.lifting import VERTICAL_FOV_DEGREES
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:

@@ -13,13 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from face_prediction.errors import RequestError
-from face_prediction.npz_file import read_npz, require_array, write_npz
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.npz import read_npz, require_array, write_npz
 
 SCHEMA = "face_track"
 VERSION = 1
 #: MediaPipe's face mesh; the ten iris points that the detector adds are not kept.
 NUM_LANDMARKS = 468
+
+
+class NoFaceError(RequestError):
+    """A video was read to its end and held no face that the detector could find."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from face_prediction.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 #: A video that decodes to less than this share of what its header promises is refused as
 #: truncated, where no damaged packet has told so already (Matroska). Edit lists drop some frames

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.files import atomic_file
 
 METRICS_FILE = "metrics.jsonl"
 CURVES_FILE = "curves.png"
@@ -79,7 +79,7 @@ class MetricsLog:
     def __init__(self, folder: Path, step: int) -> None:
         self._path = folder / METRICS_FILE
         kept = [line for line in read_metrics(self._path) if line["step"] <= step]
-        with whole_file(self._path) as temporary:
+        with atomic_file(self._path) as temporary:
             temporary.write_text("".join(map(_line, kept)), encoding="utf-8")
 
     def write(self, kind: str, step: int, numbers: Mapping[str, float]) -> None:
@@ -118,7 +118,7 @@ def draw_curves(folder: Path) -> None:
         if axes.lines:
             axes.set_yscale("log")
             axes.legend(fontsize="small")
-    with whole_file(folder / CURVES_FILE) as temporary:
+    with atomic_file(folder / CURVES_FILE) as temporary:
         figure.savefig(temporary, format="png")
 
 

@@ -12,7 +12,6 @@ import tyro
 from numpy.typing import NDArray
 
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.models.settings import (
     ModelSettings,
     Precision,
@@ -21,6 +20,7 @@ from face_prediction.models.settings import (
     preset_settings,
 )
 from face_prediction.training.seeds import generator
+from robo_manip_baselines.runs.errors import RequestError
 
 HoldOut = Literal["next", "none"]
 

@@ -18,7 +18,6 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.models.checkpoint import (
     MODEL_FILE,
     CheckpointRecord,
@@ -29,7 +28,6 @@ from face_prediction.models.checkpoint import (
 from face_prediction.models.interface import PredictorModel
 from face_prediction.models.settings import TrainSettings, make_model
 from face_prediction.tracking.video import sha256_of
-from face_prediction.training.interrupt import StopRequest
 from face_prediction.training.metrics import METRICS_FILE, draw_curves
 from face_prediction.training.options import People, TrainOptions, choose_people
 from face_prediction.training.seeds import torch_seed
@@ -44,6 +42,8 @@ from face_prediction.training.step import (
 from face_prediction.training.trainer import Pace, Trainer, run_record
 from face_prediction.training.validation import Validation
 from face_prediction.training.windows import Sampler, Windows
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.interrupt import StopRequest
 
 
 @contextmanager

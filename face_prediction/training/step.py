@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from face_prediction.errors import RequestError
 from face_prediction.models.checkpoint import fill, read_tensors, write_tensors
 from face_prediction.models.interface import PredictorModel
 from face_prediction.models.settings import TrainSettings
 from face_prediction.training.seeds import generator, torch_seed
 from face_prediction.training.windows import Batch, augment
+from robo_manip_baselines.runs.errors import RequestError
 
 
 class TrainStep:

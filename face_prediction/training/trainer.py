@@ -13,13 +13,13 @@ from pathlib import Path
 from torch import Tensor
 from tqdm import tqdm
 
-from face_prediction.errors import RequestError
 from face_prediction.models.checkpoint import CheckpointRecord, save_checkpoint
 from face_prediction.models.settings import TrainSettings
 from face_prediction.training.metrics import MetricsLog, RunningMean
 from face_prediction.training.step import Progress, TrainStep, save_state
 from face_prediction.training.validation import Validation, selection_error
 from face_prediction.training.windows import Sampler, Windows, batches
+from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History, PredictorModel
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.training.seeds import generator
+from robo_manip_baselines.runs.errors import RequestError
 
 
 class PictureStore:

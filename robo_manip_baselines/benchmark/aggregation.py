@@ -26,8 +26,8 @@ from robo_manip_baselines.benchmark.statistics.outcomes import Line, read_lines
 from robo_manip_baselines.benchmark.statistics.study import Study, analyse
 from robo_manip_baselines.benchmark.tables.table import write_tables
 from robo_manip_baselines.benchmark.work_item import Store, Unit, versions
-from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.rollout.results import RESULTS, read_results
+from robo_manip_baselines.runs.files import atomic_file
 
 REPORT = "report.html"
 VERSIONS = "versions.json"

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.envs.mujoco.face.motion import PREDICTION, MotionLibrary
 from robo_manip_baselines.observation import MAX_HORIZON
+from robo_manip_baselines.runs.files import atomic_file
 
 
 def persistence(library: MotionLibrary) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from robo_manip_baselines.data.files import atomic_file
+from robo_manip_baselines.runs.files import atomic_file
 
 OUT = "out"
 """Folder, in that of the unit, of what it makes."""

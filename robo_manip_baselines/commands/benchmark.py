@@ -33,11 +33,12 @@ from robo_manip_baselines.benchmark.scheduler import (
     spelt,
 )
 from robo_manip_baselines.benchmark.work_item import Store, Unit, is_of_other_source
-from robo_manip_baselines.data.files import prepare_folder
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
-from robo_manip_baselines.runs.command import EXIT_FAILED
+from robo_manip_baselines.runs.command import EXIT_FAILED, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import prepare_folder
+from robo_manip_baselines.training.requirements import prepare_pytorch
 
 EXAMPLE = "python bin/Benchmark.py feeding --preset smoke"
 
@@ -292,3 +293,9 @@ def _workers(options: BenchmarkOptions, plan: Plan) -> int:
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
     return options.num_workers or max(cores // plan.preset.threads, 1)
+
+
+def main(args: Sequence[str]) -> int:
+    """Run ``bin/Benchmark.py``."""
+    prepare_pytorch()
+    return benchmark(parse(BenchmarkOptions, EXAMPLE, args=args))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ import tyro
 from robo_manip_baselines.data.episode import read_metadata
 from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes
 from robo_manip_baselines.data.verify import damage_summary, verify_dataset
+from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -107,3 +109,16 @@ def _spread(values: list[float]) -> str:
     """Mean, sample standard deviation and range."""
     deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
     return f"{np.mean(values):.2f} ± {deviation:.2f} ({min(values):.2f} … {max(values):.2f})"
+
+
+def main(args: Sequence[str]) -> int:
+    """Run ``bin/Dataset.py``."""
+    options = parse(
+        Command,
+        example="python bin/Dataset.py verify dataset/FeedingEnv",
+        description="Inspect and verify a folder of episodes.",
+        args=args,
+    )
+    text, code = options.run()
+    print(text)  # noqa: T201
+    return code

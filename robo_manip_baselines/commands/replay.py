@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import tyro
 from robo_manip_baselines.data import list_episodes
 from robo_manip_baselines.rollout.replay import deviation
 from robo_manip_baselines.rollout.videos import write_preview
+from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
 
 EXAMPLE = "python bin/Replay.py dataset/FeedingEnv/episode_000000.hdf5 --video replay.mp4"
@@ -50,3 +52,8 @@ def replay_command(options: ReplayOptions) -> int:
         write_preview(options.video, paths)
         print(f"video: {options.video}")  # noqa: T201
     return int(strays > 0)
+
+
+def main(args: Sequence[str]) -> int:
+    """Run ``bin/Replay.py``."""
+    return replay_command(parse(ReplayOptions, EXAMPLE, args=args))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.observation.spec import CorruptionOptions, parse_cameras, parse_image_size
 from robo_manip_baselines.rollout.demonstrate import Collection, Summary, collect
 from robo_manip_baselines.rollout.videos import write_preview
+from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
 
 EXAMPLE = """python bin/Rollout.py FeedingEnv --scripted --num_episodes 50 --workers 2
@@ -235,3 +237,8 @@ def table(collection: Collection, summary: Summary, video: Path | None) -> str:
     }
     width = max(map(len, rows))
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+
+
+def main(args: Sequence[str]) -> None:
+    """Run ``bin/Rollout.py``."""
+    rollout(parse(RolloutOptions, EXAMPLE, args=args))

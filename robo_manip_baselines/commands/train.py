@@ -12,9 +12,10 @@ from typing import Any
 import torch
 
 from robo_manip_baselines.policy.checkpoint import Checkpoint, read_checkpoint
-from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial
+from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
 from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import locked
 from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, open_board, read_metrics, write_curves
 from robo_manip_baselines.training.device import (
@@ -24,11 +25,11 @@ from robo_manip_baselines.training.device import (
     prepare_device,
 )
 from robo_manip_baselines.training.options import FREE, TrainOptions, parse_options
+from robo_manip_baselines.training.requirements import prepare_pytorch
 from robo_manip_baselines.training.run_folder import (
     CONFIG,
     CURVES,
     METRICS,
-    locked,
     require_same_config,
     start_anew,
     write_config,
@@ -164,7 +165,7 @@ def _finish(options: TrainOptions[Any]) -> None:
 def _open_log(options: TrainOptions[Any], start: Checkpoint | None) -> MetricsLog:
     """Prepare the run folder and open what is written on the way."""
     run = options.folder
-    remove_partial(run)
+    remove_partial_checkpoints(run)
     if start is None:
         start_anew(run)
         write_config(run, options.to_config())
@@ -193,3 +194,9 @@ def _announce(job: Job, parts: Parts, processes: Processes) -> None:
     }
     for name, text in lines.items():
         logger.info("%s: %s", name, text)
+
+
+def main(args: Sequence[str]) -> int:
+    """Run ``bin/Train.py``."""
+    prepare_pytorch()
+    return train(args)

@@ -9,25 +9,21 @@ from robo_manip_baselines.data.episode import (
     write_episode,
 )
 from robo_manip_baselines.data.files import (
-    atomic_file,
     episode_path,
     finished_seeds,
     list_episodes,
-    prepare_folder,
-    remove_temporaries,
+    remove_partial_episodes,
 )
 
 __all__ = [
     "EpisodeFileError",
     "EpisodeReader",
-    "atomic_file",
     "decode_image",
     "encode_image",
     "episode_path",
     "finished_seeds",
     "list_episodes",
-    "prepare_folder",
     "read_metadata",
-    "remove_temporaries",
+    "remove_partial_episodes",
     "write_episode",
 ]

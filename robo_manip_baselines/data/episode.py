@@ -13,7 +13,6 @@ import cv2
 import h5py
 import numpy as np
 
-from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.data.schema import (
     ATTRIBUTES,
     FIELD_BY_NAME,
@@ -32,6 +31,7 @@ from robo_manip_baselines.data.schema import (
     version_of,
 )
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import atomic_file
 
 ImageCodec = Literal["jpeg", "png", "raw"]
 CODECS: tuple[str, ...] = get_args(ImageCodec)

@@ -1,18 +1,15 @@
-"""Names of episode files, and files that are either whole or not there."""
+"""Names of episode files."""
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import remove_temporaries
 
 FAILED_FOLDER = "failed"
 _EPISODE_NAME = re.compile(r"episode_(\d{6,})\.hdf5")
-_TEMPORARY_NAME = re.compile(r"\..+\.(\d+)\.partial")
 
 
 def episode_path(folder: str | Path, seed: int, success: bool) -> Path:
@@ -52,77 +49,6 @@ def finished_seeds(folder: str | Path) -> set[int]:
     return {seed for name in names if (seed := seed_of(name)) is not None}
 
 
-def prepare_folder(folder: str | Path) -> Path:
-    """Create ``folder`` if need be and make sure that files can be written there.
-
-    Raises:
-        RequestError: if it cannot be created or written to.
-    """
-    folder = Path(folder)
-    probe = folder / f".probe.{os.getpid()}.partial"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        reason = error.strerror or error
-        raise RequestError(
-            f"cannot write to '{folder}': {reason}; choose another folder"
-        ) from error
-    return folder
-
-
-@contextmanager
-def atomic_file(path: str | Path) -> Iterator[Path]:
-    """Give a temporary name in the same folder; rename to ``path`` when the block ends well.
-
-    The data are on the disk before the name is. A block that raises leaves nothing; a killed
-    process leaves a name that `list_episodes` skips and `remove_temporaries` removes.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        yield temporary
-        _flush_to_disk(temporary)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    with suppress(OSError):  # some network file systems cannot flush a folder
-        _flush_to_disk(path.parent)
-
-
-def remove_temporaries(folder: str | Path) -> list[Path]:
-    """Remove what killed runs left in ``folder`` and ``failed/``; returns what was removed.
-
-    Files of a process that is still alive on this machine are left alone.
-    """
-    removed: list[Path] = []
-    for part in (Path(folder), Path(folder) / FAILED_FOLDER):
-        for path in sorted(part.glob(".*.partial")) if part.is_dir() else ():
-            match = _TEMPORARY_NAME.fullmatch(path.name)
-            if match and not _is_alive(int(match[1])):
-                path.unlink(missing_ok=True)
-                removed.append(path)
-    return removed
-
-
-def _is_alive(process: int) -> bool:
-    if process == os.getpid():
-        return False  # a number from an earlier run that has come round to us
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return True
-
-
-def _flush_to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def remove_partial_episodes(folder: str | Path) -> list[Path]:
+    """Remove what killed runs left in ``folder`` and ``failed/``; return the removed paths."""
+    return remove_temporaries(Path(folder), Path(folder) / FAILED_FOLDER)

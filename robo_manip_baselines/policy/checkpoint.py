@@ -19,11 +19,11 @@ from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
 from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
 from robo_manip_baselines.runs.checkpoints import (
+    checkpoint_folder,
     find_checkpoint,
     read_json,
     read_manifest,
     verify,
-    whole_folder,
     write_json,
 )
 from robo_manip_baselines.runs.errors import RequestError
@@ -169,7 +169,7 @@ def write_checkpoint(
     import safetensors.torch
 
     config, stats = _encode(checkpoint)
-    with whole_folder(folder) as temporary:
+    with checkpoint_folder(folder) as temporary:
         safetensors.torch.save_file(_on_cpu(model_state), temporary / MODEL)
         safetensors.torch.save_file(_on_cpu(trainer_tensors), temporary / TRAINER_TENSORS)
         write_json(temporary / CONFIG, config)

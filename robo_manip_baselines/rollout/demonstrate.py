@@ -25,13 +25,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from robo_manip_baselines.data import (
-    atomic_file,
     encode_image,
     episode_path,
     finished_seeds,
-    prepare_folder,
     read_metadata,
-    remove_temporaries,
+    remove_partial_episodes,
     write_episode,
 )
 from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
@@ -42,6 +40,7 @@ from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase
 from robo_manip_baselines.envs.mujoco.tasks.registry import env_id, make_env
 from robo_manip_baselines.observation import FRAME_PERIOD
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import atomic_file, prepare_folder
 
 
 @dataclass(frozen=True)
@@ -248,7 +247,7 @@ def collect(collection: Collection) -> Summary:
         env.reset(seed=collection.seeds.start)
         _refuse_other_settings(collection, env)
         prepare_folder(collection.out)
-        remove_temporaries(collection.out)
+        remove_partial_episodes(collection.out)
         done = finished_seeds(collection.out)
         todo = [seed for seed in collection.seeds if seed not in done]
         if len(todo) < len(collection.seeds):

@@ -15,9 +15,9 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from robo_manip_baselines.data import atomic_file, prepare_folder
 from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import APPROACH_LIMIT, FAILURES
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file, prepare_folder
 
 Offset = tuple[float, float, float]
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from robo_manip_baselines.data import EpisodeReader, read_metadata
-from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, FaceEnv, world_of
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
@@ -26,6 +25,7 @@ from robo_manip_baselines.rollout.replay import remake_env, replay
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
 from robo_manip_baselines.rollout.workers import Task, split_vector
+from robo_manip_baselines.runs.files import atomic_file
 
 Colour = tuple[int, int, int]
 

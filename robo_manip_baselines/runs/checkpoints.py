@@ -1,4 +1,4 @@
-"""Folders of a checkpoint: written whole or not at all, refused when anything in them is damaged.
+"""Checkpoint folders: complete or absent, refused when anything in them is damaged.
 
 ``manifest.json`` names schema, version and the SHA-256 of every other file; a folder that has its
 final name is complete, because it is renamed to it after everything has reached the disk.
@@ -6,17 +6,20 @@ final name is complete, because it is renamed to it after everything has reached
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 import re
-import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import (
+    atomic_folder,
+    file_digest,
+    read_json,
+    remove_folder,
+    remove_temporaries,
+    write_json,
+)
 
 SCHEMA = "robo_manip_baselines/checkpoint"
 SCHEMA_VERSION = 1
@@ -25,7 +28,6 @@ CHECKPOINTS = "checkpoints"
 """Folder of a run that holds its checkpoints."""
 
 _STEP_NAME = re.compile(r"step_(\d{8,})")
-_BLOCK = 1 << 20
 
 
 def step_folder(run: Path, step: int) -> Path:
@@ -68,42 +70,32 @@ def find_checkpoint(path: Path) -> Path:
 
 
 @contextmanager
-def whole_folder(folder: Path) -> Iterator[Path]:
-    """Give a temporary folder; write its manifest and rename it to ``folder`` at the end.
-
-    A block that raises leaves nothing; a killed process leaves a name that no reader takes and
-    `remove_partial` removes.
+def checkpoint_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder; write its manifest and rename it to ``folder`` at the end.
 
     Raises:
         FileExistsError: there is such a folder already.
     """
-    if folder.exists():
-        raise FileExistsError(f"{folder} exists")
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    try:
+    with atomic_folder(folder) as temporary:
         yield temporary
         digests = {path.name: file_digest(path) for path in sorted(temporary.iterdir())}
-        manifest = {"schema": SCHEMA, "version": SCHEMA_VERSION, "sha256": digests}
-        write_json(temporary / MANIFEST, manifest)
+        write_json(
+            temporary / MANIFEST, {"schema": SCHEMA, "version": SCHEMA_VERSION, "sha256": digests}
+        )
         mode = (temporary / MANIFEST).stat().st_mode
         for path in temporary.iterdir():
             path.chmod(mode)  # safetensors gives its files to the owner alone
-            _flush(path)
-        _flush(temporary)
-        temporary.rename(folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-    with suppress(OSError):  # some network file systems cannot flush a folder
-        _flush(folder.parent)
 
 
-def remove_partial(run: Path) -> None:
+def remove_partial_checkpoints(run: Path) -> None:
     """Remove what killed processes left among a run's checkpoints."""
-    for path in (run / CHECKPOINTS).glob(".step_*.partial"):
-        shutil.rmtree(path, ignore_errors=True)
+    remove_temporaries(run / CHECKPOINTS)
+
+
+def prune_checkpoints(run: Path, kept: int) -> None:
+    """Keep the newest checkpoints only."""
+    for _, folder in list_checkpoints(run)[:-kept]:
+        remove_folder(folder)
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
@@ -142,43 +134,3 @@ def verify(folder: Path, digests: Mapping[str, str], name: str) -> Path:
             "changed); copy it again, or remove the folder to use an earlier checkpoint"
         )
     return path
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file, 64 hexadecimal digits."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON for people to read: indented, keys in the given order, no NaN."""
-    text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        RequestError: it is missing, or no JSON object.
-    """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RequestError(f"cannot read '{path}': {error.strerror or error}") from error
-    except ValueError as error:
-        raise RequestError(f"'{path}' is damaged: {error}") from error
-    if not isinstance(value, dict):
-        raise RequestError(f"'{path}' is damaged: it holds no JSON object")
-    return value
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,4 +1,4 @@
-"""What every ``bin/*.py`` does the same way: options in, one clear line out when they are wrong.
+"""Command lines: options parsed into dataclasses, errors as one line, exit codes.
 
 Exit codes: 0 done, 1 something failed that was not the user's doing, 2 the request was wrong,
 130 interrupted.
@@ -21,7 +21,6 @@ from typing import Any, NoReturn, TypeVar, cast, overload
 
 import tyro
 
-from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.runs.errors import RequestError
 
 Options = TypeVar("Options")
@@ -54,13 +53,16 @@ _PLAINER = (
 _OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 
-def run_command(main: Callable[[], int | None]) -> NoReturn:
-    """Run ``main`` and end the process with the exit code that fits how it ended.
+def run_command(
+    main: Callable[[], int | None], explain: Callable[[Exception], str | None] | None = None
+) -> NoReturn:
+    """Run ``main`` and end the process with the matching exit code.
 
-    A `RequestError` becomes its one line on stderr, without a traceback.
+    A `RequestError` becomes one line on stderr, without a traceback.
 
     Args:
-        main: the command; what it returns is the exit code, None being 0.
+        main: the command; returns the exit code, None being 0.
+        explain: returns the line for an exception whose cause is the request, else None.
 
     Raises:
         SystemExit: always.
@@ -82,7 +84,7 @@ def run_command(main: Callable[[], int | None]) -> NoReturn:
             traceback.print_exc()
         code = EXIT_FAILED
     except Exception as error:
-        if problem := _backend_problem(error):
+        if problem := explain and explain(error):
             code = _say(f"error: {problem}", EXIT_WRONG_REQUEST)
         else:
             traceback.print_exc()
@@ -225,16 +227,6 @@ def _box_to_line(text: str) -> str:
     for pattern, plain in _PLAINER:
         message = re.sub(pattern, plain, message)
     return message
-
-
-def _backend_problem(error: Exception) -> str | None:
-    """Say why MuJoCo could not be imported with the backend that ``$MUJOCO_GL`` names, if so."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    modules = {frame.f_globals.get("__name__", "") for frame in frames}
-    if "mujoco" in sys.modules or not any(name.split(".")[0] == "mujoco" for name in modules):
-        return None
-    problem = opengl_problem()
-    return problem and f"{problem} (or unset MUJOCO_GL: --cameras none --preview 0 needs no OpenGL)"
 
 
 def _help_hint() -> str:

@@ -8,7 +8,7 @@ import threading
 from types import FrameType, TracebackType
 from typing import Any
 
-_NOTICE = b"\nstopping: saving after this step\n"
+_NOTICE = b"\nstopping: saving after this step; Ctrl-C again stops at once\n"
 
 
 class StopRequest:

@@ -1,4 +1,4 @@
-"""What training says of itself: means over some steps, ``metrics.jsonl``, TensorBoard, wandb.
+"""Metrics of a training run: ``metrics.jsonl``, its curves, TensorBoard and wandb.
 
 A line of ``metrics.jsonl`` is a JSON object with ``kind``: ``train`` (means over the steps since
 the last such line) or ``validation``, and ``step``, the number of steps done.
@@ -14,46 +14,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-import torch
-from torch import Tensor
-
-from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import atomic_file
 
 LOGGERS = ("tensorboard", "wandb", "none")
-
-
-class RunningMean:
-    """Means of scalars that stay on the device until they are asked for.
-
-    Attributes:
-        names: of the scalars; none before the first step.
-        count: steps that are summed.
-        sums: () or (n,) float64, on the device.
-    """
-
-    def __init__(self) -> None:
-        self.names: tuple[str, ...] = ()
-        self.count = 0
-        self.sums: Tensor | None = None
-
-    def add(self, metrics: Mapping[str, Tensor]) -> None:
-        """Take in the scalars of a step."""
-        values = torch.stack([value.double() for value in metrics.values()])
-        if self.sums is None:
-            self.names, self.sums = tuple(metrics), values
-        else:
-            self.sums += values
-        self.count += 1
-
-    def means(self) -> Tensor:
-        """Return the means, (n,) float64, still on the device; nothing is reset."""
-        assert self.sums is not None, "no step yet"
-        return self.sums / self.count
-
-    def reset(self) -> None:
-        """Start anew."""
-        self.sums, self.count = None, 0
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

@@ -2,45 +2,19 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from robo_manip_baselines.data.files import atomic_file, prepare_folder
-from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 CONFIG = "config.yaml"
 METRICS = "metrics.jsonl"
 CURVES = "curves.png"
-KEPT_CHECKPOINTS = 2
-
-
-@contextmanager
-def locked(run: Path) -> Iterator[None]:
-    """Hold the folder for one training process; a killed process holds nothing.
-
-    Raises:
-        RequestError: another process holds it, or it cannot be written to.
-    """
-    prepare_folder(run)
-    descriptor = os.open(run / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RequestError(
-                f"'{run}' is being written by another training process; choose another --out"
-            ) from error
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -87,15 +61,6 @@ def require_same_config(run: Path, config: Mapping[str, Any], free: frozenset[st
                 f"'{run}' holds a run with {name} {_show(old)}, not {_show(new)}; "
                 "choose another --out, or give the same options"
             )
-
-
-def prune(run: Path) -> None:
-    """Keep the newest checkpoints only."""
-    for _, folder in list_checkpoints(run)[:-KEPT_CHECKPOINTS]:
-        # Renamed first: a process that is killed here leaves no checkpoint with files missing.
-        leaving = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-        folder.rename(leaving)
-        shutil.rmtree(leaving, ignore_errors=True)
 
 
 def start_anew(run: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,39 @@ from robo_manip_baselines.policy.presets import TrainSettings
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.device import Processes
 from robo_manip_baselines.training.timing import PhaseClock
+
+
+class RunningMean:
+    """Means of scalars that stay on the device until they are asked for.
+
+    Attributes:
+        names: of the scalars; none before the first step.
+        count: steps that are summed.
+        sums: () or (n,) float64, on the device.
+    """
+
+    def __init__(self) -> None:
+        self.names: tuple[str, ...] = ()
+        self.count = 0
+        self.sums: Tensor | None = None
+
+    def add(self, metrics: Mapping[str, Tensor]) -> None:
+        """Take in the scalars of a step."""
+        values = torch.stack([value.double() for value in metrics.values()])
+        if self.sums is None:
+            self.names, self.sums = tuple(metrics), values
+        else:
+            self.sums += values
+        self.count += 1
+
+    def means(self) -> Tensor:
+        """Return the means, (n,) float64, still on the device; nothing is reset."""
+        assert self.sums is not None, "no step yet"
+        return self.sums / self.count
+
+    def reset(self) -> None:
+        """Start anew."""
+        self.sums, self.count = None, 0
 
 
 def make_optimizer(model: PolicyModel, settings: TrainSettings) -> torch.optim.AdamW:

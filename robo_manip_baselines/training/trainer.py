@@ -25,16 +25,15 @@ from tqdm import tqdm
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.policy.checkpoint import MODEL, Checkpoint, read_trainer, write_checkpoint
-from robo_manip_baselines.runs.checkpoints import step_folder
+from robo_manip_baselines.runs.checkpoints import prune_checkpoints, step_folder
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.metrics import MetricsLog, RunningMean
+from robo_manip_baselines.runs.metrics import MetricsLog
 from robo_manip_baselines.training.batching import BatchLoader
 from robo_manip_baselines.training.device import Processes, autocast_type
 from robo_manip_baselines.training.images import FrameSource, free_memory
-from robo_manip_baselines.training.run_folder import prune
 from robo_manip_baselines.training.sampling import StateNoise
 from robo_manip_baselines.training.setup import Job
-from robo_manip_baselines.training.step import TrainStep
+from robo_manip_baselines.training.step import RunningMean, TrainStep
 from robo_manip_baselines.training.validation import Validation
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -221,6 +220,8 @@ logger = logging.getLogger(__name__)
 _STEPS_BETWEEN_VOTES = 10
 """On several GPUs, steps between asking whether any process was told to stop: asking waits."""
 
+KEPT_CHECKPOINTS = 2
+
 _LINES = 10
 """Lines about progress where there is no terminal for a bar."""
 
@@ -383,7 +384,7 @@ class Trainer:
         checkpoint = dataclasses.replace(self._checkpoint, step=self._step)
         write_checkpoint(folder, checkpoint, state, tensors, json)
         self._saved_step = self._step
-        prune(self._run)
+        prune_checkpoints(self._run, KEPT_CHECKPOINTS)
 
     def _require_finite(self, flags: torch.Tensor) -> None:
         if not self._processes.any(not bool(flags.all()), self._train_step.device):

@@ -13,16 +13,15 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.data import (
-    atomic_file,
     episode_path,
     finished_seeds,
     list_episodes,
-    prepare_folder,
     remove_temporaries,
 )
 from robo_manip_baselines.data.files import seed_of
 from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file, prepare_folder
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.library import read_attributions
+from robo_manip_baselines.runs.errors import RequestError
 
 CSV = """clip,subject,ship,licence,source,note
 a.mp4,ann,yes,MIT,someone/somewhere,"nods, talks"

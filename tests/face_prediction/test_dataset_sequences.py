@@ -10,8 +10,8 @@ import pytest
 from face_prediction.dataset.manifest import FACTS, largest_angle, sequence_facts
 from face_prediction.dataset.sequences import clip_frames, find_sequences
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.tracking.lifting import LIPS
+from robo_manip_baselines.runs.errors import RequestError
 
 SETTINGS = SequenceSettings(history=8, future=2, stride=5)
 

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation import (
     cluster_bootstrap,
     mouth_distances,
@@ -18,6 +17,7 @@ from face_prediction.evaluation import (
 )
 from face_prediction.evaluation.errors import mouth_errors
 from face_prediction.tracking.lifting import LIPS
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def pair_of_faces(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation import (
     PAPER_CAMERA,
     Camera,
@@ -24,6 +23,7 @@ from face_prediction.evaluation import (
     save_error_stats,
 )
 from face_prediction.evaluation.error_stats import autocorrelation, neighbours
+from robo_manip_baselines.runs.errors import RequestError
 
 STRIDE = 5
 

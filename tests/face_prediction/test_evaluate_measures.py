@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.batches import DETECTOR_SIDE, DetectedPredictor, find_landmarks
 from face_prediction.evaluation.calibration import LEVELS, covered, interval_levels
 from face_prediction.evaluation.errors import area_average, similarities
@@ -18,6 +17,7 @@ from face_prediction.evaluation.setup import BaselinePredictor
 from face_prediction.forecast.simple import ConstantVelocity, Persistence
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.detector import FaceDetection
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def pictures(seed: int, size: int = 24) -> np.ndarray:

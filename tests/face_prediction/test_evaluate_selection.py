@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.setup import common_folds, exchange_pictures, networks
 from face_prediction.prediction.interface import Forecast, PictureNeeds
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass

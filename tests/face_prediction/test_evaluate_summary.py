@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.errors import RequestError
 from face_prediction.evaluation import cluster_bootstrap, skill
 from face_prediction.evaluation.calibration import LEVELS
 from face_prediction.evaluation.errors import mouth_errors
@@ -18,6 +17,7 @@ from face_prediction.evaluation.scoring import Judged, Verdict
 from face_prediction.evaluation.setup import Role, Selection
 from face_prediction.evaluation.statistics import KindSummary, summarise
 from face_prediction.evaluation.tables import Evaluation, markdown, results_json, write_results
+from robo_manip_baselines.runs.errors import RequestError
 
 N, H = 30, 5
 

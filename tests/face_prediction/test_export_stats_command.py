@@ -14,7 +14,6 @@ from face_prediction.commands import export_stats as export_stats_command
 from face_prediction.commands.cli import main
 from face_prediction.commands.export_stats import ExportStatsOptions, run_export_stats
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.evaluation import Camera, load_error_stats
 from face_prediction.evaluation import setup as cross_fit_module
 from face_prediction.evaluation.library_errors import camera_with_crop, crop_spans
@@ -24,6 +23,7 @@ from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.crop import crop_around
 from face_prediction.tracking.tracks import save_track
 from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

@@ -13,7 +13,6 @@ import pytest
 
 from face_prediction.commands import extract as extract_command
 from face_prediction.commands.cli import main
-from face_prediction.errors import RequestError
 from face_prediction.tracking import detector as detector_module
 from face_prediction.tracking import detector as model_file
 from face_prediction.tracking.detector import (
@@ -24,6 +23,7 @@ from face_prediction.tracking.detector import (
     find_model,
 )
 from face_prediction.tracking.tracks import load_track
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def picture(left: int | None) -> np.ndarray:

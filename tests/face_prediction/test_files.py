@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.library import build_library, load_library, save_library
 from face_prediction.motion.motion import MotionSettings, lift
-from face_prediction.npz_file import write_npz
 from face_prediction.tracking.tracks import load_track, save_track
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.npz import write_npz
 
 
 def mouth(frames: int) -> np.ndarray:

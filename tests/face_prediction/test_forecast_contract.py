@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast import (
     FORECASTERS,
     Forecaster,
@@ -13,6 +12,7 @@ from face_prediction.forecast import (
     fit_forecaster,
     restore_forecaster,
 )
+from robo_manip_baselines.runs.errors import RequestError
 
 HORIZON = 5
 

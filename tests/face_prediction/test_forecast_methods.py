@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast import LandmarkSequences, mouth_centre
 from face_prediction.forecast.autoregression import (
     LandmarkAutoregression,
@@ -22,6 +21,7 @@ from face_prediction.forecast.autoregression import (
 from face_prediction.forecast.interface import subject_folds
 from face_prediction.forecast.simple import ConstantVelocity, Line, Persistence
 from face_prediction.tracking.lifting import LIPS
+from robo_manip_baselines.runs.errors import RequestError
 
 FACE = np.random.default_rng(5).uniform(0.2, 0.8, (468, 2))
 AHEAD = np.arange(1, 6)[:, None, None]

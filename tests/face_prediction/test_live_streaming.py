@@ -10,7 +10,6 @@ import pytest
 
 from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.forecast.simple import ConstantVelocity
 from face_prediction.live.streaming import (
     LandmarkForecasting,
@@ -20,6 +19,7 @@ from face_prediction.live.streaming import (
 )
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.crop import Crop, crop_around
+from robo_manip_baselines.runs.errors import RequestError
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 pytestmark = pytest.mark.long

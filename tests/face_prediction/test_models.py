@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from face_prediction.errors import RequestError
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.approaches import (
     CrossAttention,
@@ -27,6 +26,7 @@ from face_prediction.models.settings import (
     preset_settings,
     settings_class,
 )
+from robo_manip_baselines.runs.errors import RequestError
 
 APPROACHES = ("image_only", "simple_fusion", "cross_attention")
 TINY = {

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.motion import (
     MotionSettings,
     QualityLimits,
@@ -15,6 +14,7 @@ from face_prediction.motion.motion import (
     smooth_depth,
     step_tremor,
 )
+from robo_manip_baselines.runs.errors import RequestError
 
 FPS = 30.0
 SHORT = MotionSettings(min_run=1.0)  # windows of 31 frames

@@ -16,7 +16,6 @@ from face_prediction.commands.predict import PredictOptions, run_predict
 from face_prediction.dataset.history_images import history_pictures
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import clip_frames
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.setup import CrossFit, Fitted
 from face_prediction.forecast import mouth_centre
 from face_prediction.motion.library import load_library, save_library
@@ -25,6 +24,7 @@ from face_prediction.prediction.predicted_motion import find_origins
 from face_prediction.tracking.lifting import LIPS
 from face_prediction.tracking.tracks import FaceTrack, load_track, save_track
 from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

@@ -14,10 +14,10 @@ from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.manifest import ClipEntry, Manifest, write_manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.setup import cross_fit
 from face_prediction.live.streaming import StreamingPredictor
 from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 pytestmark = pytest.mark.long

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from face_prediction.errors import RequestError
 from face_prediction.motion.motion import QualityLimits, assess, stretches, tremor
+from robo_manip_baselines.runs.errors import RequestError
 
 FPS = 30.0
 LIMITS = QualityLimits()

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from face_prediction.commands import export_surface as surface
 from face_prediction.commands.export_surface import ExportSurfaceOptions, Topology, export_surface
-from face_prediction.errors import RequestError
 from face_prediction.motion.surface import (
     CANONICAL_MEAN,
     align,
@@ -30,6 +29,7 @@ from face_prediction.motion.surface import (
     symmetric,
 )
 from face_prediction.tracking.tracks import FaceTrack, save_track
+from robo_manip_baselines.runs.errors import RequestError
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "robo_manip_baselines/envs/mujoco/face/assets/face_surface.npz"

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.video import VideoReader, require_video, sha256_of
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from face_prediction.errors import RequestError
 from face_prediction.tracking.detector import FaceDetection
 from face_prediction.tracking.extract import (
     FaceFollower,
@@ -26,6 +25,7 @@ from face_prediction.tracking.geometry import (
     rigid_face,
     rigid_head_poses,
 )
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def canonical() -> CanonicalFace:

@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
 from robo_manip_baselines.policy.interface import Batch, Sizes
+from robo_manip_baselines.runs.files import atomic_file
 
 ACT_STEP = Path(__file__).with_name("act_step.json")
 

@@ -29,7 +29,7 @@ from robo_manip_baselines.policy.checkpoint import (
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
 from robo_manip_baselines.policy.registry import make_model
-from robo_manip_baselines.runs.checkpoints import step_folder, whole_folder
+from robo_manip_baselines.runs.checkpoints import checkpoint_folder, step_folder
 from robo_manip_baselines.runs.errors import RequestError
 
 FILES = ("model.safetensors", "config.json", "stats.json", "trainer.safetensors", "trainer.json")
@@ -203,7 +203,7 @@ def test_a_configuration_that_does_not_fit_is_refused(
     folder = run / "checkpoints" / "step_00000007"
     config = json.loads((folder / "config.json").read_text())
     change(config)
-    with whole_folder(run / "other") as other:
+    with checkpoint_folder(run / "other") as other:
         for name in FILES:
             shutil.copy(folder / name, other)
         (other / "config.json").write_text(json.dumps(config))
@@ -222,7 +222,7 @@ def test_weights_of_another_shape_are_refused(run: Path) -> None:
 
 def test_a_folder_that_fails_halfway_is_not_there(tmp_path: Path) -> None:
     def fill(folder: Path) -> None:
-        with whole_folder(folder) as temporary:
+        with checkpoint_folder(folder) as temporary:
             (temporary / "a").write_text("half")
             raise OSError("disk full")
 

@@ -11,12 +11,8 @@ import pytest
 import torch
 
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.metrics import (
-    MetricsLog,
-    RunningMean,
-    open_board,
-    read_metrics,
-)
+from robo_manip_baselines.runs.metrics import MetricsLog, open_board, read_metrics
+from robo_manip_baselines.training.step import RunningMean
 
 
 class Board:

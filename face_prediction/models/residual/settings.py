@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from face_prediction.errors import RequestError
 from face_prediction.models.settings import PICTURE_SIZES, ModelSettings
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)

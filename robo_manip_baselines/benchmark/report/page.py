@@ -21,9 +21,9 @@ from robo_manip_baselines.benchmark.statistics.outcomes import Line, Selection
 from robo_manip_baselines.benchmark.statistics.study import ArmFigures, Study
 from robo_manip_baselines.benchmark.tables.study import study_tables
 from robo_manip_baselines.benchmark.tables.table import Table
-from robo_manip_baselines.data.files import atomic_file
 from robo_manip_baselines.rollout.videos import VideoWriter
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 WIDTH = 1280
 """pixels at most: as wide as the page."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robo_manip_baselines.benchmark.statistics.outcomes import Selection
-from robo_manip_baselines.data.files import atomic_file
+from robo_manip_baselines.runs.files import atomic_file
 
 Value = str | int | float | bool | None
 

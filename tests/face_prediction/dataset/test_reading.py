@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

@@ -9,8 +9,8 @@ import pytest
 
 import face_prediction.commands.evaluate as command
 from face_prediction.commands.cli import main
-from face_prediction.errors import RequestError
 from face_prediction.evaluation.setup import load_checkpoint
+from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import run
 

@@ -12,10 +12,10 @@ import pytest
 
 from face_prediction.commands import live as live_command
 from face_prediction.commands.live import LiveOptions, run_live
-from face_prediction.errors import RequestError
 from face_prediction.live import sinks
 from face_prediction.live.sinks import Window
 from face_prediction.tracking.video import VideoFrame, VideoReader
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

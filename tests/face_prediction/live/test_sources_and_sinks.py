@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.errors import RequestError
 from face_prediction.live import sinks, sources
 from face_prediction.live.sinks import VideoFile, Window
 from face_prediction.live.sources import camera_frames, video_frames
 from face_prediction.tracking.video import VideoFrame, VideoReader
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 

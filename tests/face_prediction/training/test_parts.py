@@ -16,13 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from face_prediction.dataset.manifest import fold_split
-from face_prediction.errors import RequestError
 from face_prediction.models.settings import TrainSettings
-from face_prediction.training.interrupt import StopRequest
 from face_prediction.training.metrics import MetricsLog, RunningMean, draw_curves, read_metrics
 from face_prediction.training.options import choose_people
 from face_prediction.training.seeds import generator, torch_seed
 from face_prediction.training.windows import PictureStore, Sampler
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.interrupt import StopRequest
 
 
 class TestSampler:

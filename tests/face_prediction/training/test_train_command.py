@@ -14,7 +14,6 @@ import torch
 
 from face_prediction.commands.train import TrainOptions, run_train
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.errors import RequestError
 from face_prediction.evaluation import mouth_distances, mouth_residuals
 from face_prediction.models.checkpoint import read_checkpoint, read_tensors
 from face_prediction.models.learned import LearnedPredictor
@@ -22,6 +21,7 @@ from face_prediction.tracking.lifting import LIPS
 from face_prediction.training.metrics import read_metrics
 from face_prediction.training.setup import locked
 from face_prediction.training.step import TrainStep
+from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
 NETWORK = ("model.safetensors", "config.json")

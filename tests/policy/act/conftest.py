@@ -32,7 +32,7 @@ SIZES = Sizes(state=5, action=3, cameras=2, image=(40, 70))
 def make_model(monkeypatch: pytest.MonkeyPatch) -> Callable[..., ActModel]:
     """Build a tiny network with the same weights for the same settings."""
     # All the blocks, few of the channels: 11 million weights take long to draw.
-    # Multiples of 8: with fewer channels, oneDNN of PyTorch 2.13 corrupts memory on AVX2 processors.
+    # Multiples of 8: with fewer, oneDNN of PyTorch 2.13 corrupts memory on AVX2 processors.
     monkeypatch.setattr(backbone, "WIDTHS", (8, 8, 8, 16))
 
     def make(sizes: Sizes = SIZES, **settings: Any) -> ActModel:

@@ -13,6 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
+import traceback
 from collections.abc import Sequence
 
 # What Debian and Ubuntu call the libraries that each backend of MuJoCo opens; found by installing
@@ -63,6 +64,16 @@ def opengl_problem() -> str | None:
     The answer is found by rendering in a subprocess (a second or two), once per process.
     """
     return _probe(backend_in_use())[1]
+
+
+def backend_problem(error: Exception) -> str | None:
+    """Return why MuJoCo could not be imported with ``$MUJOCO_GL``, if that is what ``error`` is."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    modules = {frame.f_globals.get("__name__", "") for frame in frames}
+    if "mujoco" in sys.modules or not any(name.split(".")[0] == "mujoco" for name in modules):
+        return None
+    problem = opengl_problem()
+    return problem and f"{problem} (or unset MUJOCO_GL: --cameras none --preview 0 needs no OpenGL)"
 
 
 def _probe(backend: str) -> tuple[str, str | None]:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from face_prediction.errors import RequestError
-from face_prediction.whole_file import whole_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 Arrays = dict[str, np.ndarray]
 
@@ -23,7 +23,7 @@ def write_npz(path: Path, arrays: Arrays) -> None:
     Raises:
         RequestError: the folder cannot be written.
     """
-    with whole_file(path) as temporary, temporary.open("wb") as stream:
+    with atomic_file(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
 
 
