@@ -9,8 +9,8 @@ them to ``act``. Every slot is at a step of its own; what happens in one changes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.state import to_vector, vector_names
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import Acting
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -187,35 +186,36 @@ class ChunkPolicy:
         rows = tile or (1 if self._device.type == "cpu" else CUDA_TILE)
         # The same memory for every tile: pinned, so that a GPU can fetch it by itself.
         pinned = self._device.type == "cuda"
-        self._state = torch.zeros(rows, len(vector_names(spec)), pin_memory=pinned)
+        self._state = torch.zeros(rows, len(normalization.state_mean), pin_memory=pinned)
         shape = (rows, len(spec.cameras), *spec.image_size, 3)
         self._images = torch.zeros(shape, dtype=torch.uint8, pin_memory=pinned)
 
-    def reset(self, slots: Slots) -> None:
-        """Start episodes in these slots."""
+    def reset(self, slots: Slots, seeds: Sequence[int]) -> None:
+        """Start the episodes of these seeds in these environments."""
         self._chunking.reset(slots)
 
-    def looks(self, slots: Slots) -> NDArray[np.bool_]:
-        """Say, (b,), which slots will look at their cameras when they act next."""
+    def needs_images(self, slots: Slots) -> NDArray[np.bool_]:
+        """Return, (b,), whether the policy reads the images when it acts next."""
         return self._chunking.needs_chunk(slots)
 
-    def act(self, observations: Mapping[str, NDArray[Any]], slots: Slots) -> NDArray[np.float32]:
+    def act(
+        self, vectors: NDArray[np.float32], images: NDArray[np.uint8] | None, slots: Slots
+    ) -> NDArray[np.float32]:
         """Return the next actions (b, A) in the units of the environment.
 
         Args:
-            observations: each of the spec's keys, (b, ...); images of slots that do not look may
-                hold anything.
-            slots: (b,) the slots that they come from.
+            vectors: (b, S) packed observations.
+            images: (b, N, H, W, 3); rows that need none may hold anything.
+            slots: (b,) the environments that they come from.
 
         Raises:
             RequestError: the network gives numbers that are not finite.
         """
         rows = np.flatnonzero(self._chunking.needs_chunk(slots))
-        state = self._normalization.normalized_state(to_vector(self._spec, observations))
-        views = [observations[key] for key in self._spec.image_keys()]
+        state = self._normalization.normalized_state(vectors)
         size = len(self._state)
         chunks = [
-            self._predict(state, views, rows[start : start + size])
+            self._predict(state, images, rows[start : start + size])
             for start in range(0, len(rows), size)
         ]
         shape = (0, self._model.chunk_size, len(self._normalization.action_mean))
@@ -226,17 +226,16 @@ class ChunkPolicy:
 
     @torch.inference_mode()
     def _predict(
-        self, state: NDArray[np.float32], views: list[NDArray[np.uint8]], rows: NDArray[np.intp]
+        self, state: NDArray[np.float32], views: NDArray[np.uint8] | None, rows: NDArray[np.intp]
     ) -> NDArray[np.float32]:
         """Return the chunks, normalised, (r, K, A), of at most one tile's worth of rows."""
         count = len(rows)
         self._state.zero_()
         self._state.numpy()[:count] = state[rows]
         images = None
-        if views:
+        if views is not None:
             self._images[count:].zero_()
-            for camera, view in enumerate(views):
-                self._images.numpy()[:count, camera] = view[rows]
+            self._images.numpy()[:count] = views[rows]
             images = self._images.to(self._device, non_blocking=True)
         inputs = self._state.to(self._device, non_blocking=True)
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._is_autocast):

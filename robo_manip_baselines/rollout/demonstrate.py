@@ -6,20 +6,17 @@ import atexit
 import contextlib
 import json
 import logging
-import platform
 import signal
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -33,14 +30,11 @@ from robo_manip_baselines.data import (
     write_episode,
 )
 from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
-from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, world_of
-from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS, FeedingExpert
-from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase
-from robo_manip_baselines.envs.mujoco.tasks.registry import env_id, make_env
-from robo_manip_baselines.observation import FRAME_PERIOD
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import atomic_file, prepare_folder
+from robo_manip_baselines.runs.versions import software_versions
 
 
 @dataclass(frozen=True)
@@ -70,94 +64,45 @@ def demonstrate(
         codec: see ``data.encode_image``.
         quality: of JPEG, 1 to 100.
     """
-    world = env.unwrapped
-    if not isinstance(world, FeedingEnv):
-        raise TypeError(f"the scripted experts act in FeedingEnv, not in {type(world).__name__}")
-    actor = FeedingExpert(world, EXPERTS[expert])
+    if env.spec is None:
+        raise ValueError("the environment must be made by its id, so that it can be made again")
+    world = world_of(env)
+    actor = world.task.make_expert(expert, world)
     rows: dict[str, list[Any]] = defaultdict(list)
     images: dict[str, list[NDArray[np.uint8]]] = {
         camera: [] for camera in world.observation_spec.cameras
     }
-    observation, _ = env.reset(seed=seed)
-    start = world.object_pose
+    observation, info = env.reset(seed=seed)
+    start = world.start_attributes()
     actor.reset()
     ended = False
     while not ended:
         action = actor.act()
-        for name, value in _row(world).items():
+        for name, value in world.episode_row().items():
             rows[name].append(value)
         rows["action"].append(action)
         for key, camera in world.observation_spec.image_keys().items():
             images[camera].append(encode_image(observation[key], codec, quality))
-        observation, _, terminated, truncated, _ = env.step(action)
-        rows["is_success"].append(world.progress.is_success)
-        rows["is_success_strict"].append(world.progress.is_success_strict)
+        observation, _, terminated, truncated, info = env.step(action)
+        rows["is_success"].append(info["is_success"])
+        rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated
+    time = info["completion_time"]
     attributes = {
-        **_attributes(env, world),
+        "env_id": env.spec.id,
+        "env_kwargs": dict(env.spec.kwargs),
+        **start,
+        "is_success": info["is_success"],
+        "is_success_strict": info["is_success_strict"],
+        "completion_time": np.nan if time is None else time,
+        "versions": software_versions("mujoco", "numpy", "robo_manip_baselines"),
         "seed": seed,
         "expert": expert,
-        "object_initial_pose": start,
         "image_codec": codec,
         "image_quality": quality,
     }
-    return Demonstration(
-        {name: np.asarray(values) for name, values in rows.items()}, images, attributes
-    )
-
-
-def _row(world: FeedingEnv) -> dict[str, Any]:
-    """Return what is so before an action."""
-    truth = world.truth()
-    return {
-        "time": world.time,
-        "joint_position": truth.joint_position.ravel(),
-        "joint_velocity": truth.joint_velocity.ravel(),
-        "gripper_position": truth.gripper_position,
-        "gripper_velocity": truth.gripper_velocity,
-        "end_effector_position": truth.end_effector_position,
-        "end_effector_orientation": world.gripper_orientation,
-        "mouth_position": truth.mouth_position,
-        **({} if truth.predicted_mouth is None else {"predicted_mouth": truth.predicted_mouth}),
-        "head_orientation": world.head_orientation,
-        "jaw_opening": world.jaw_opening,
-        "object_pose": world.object_pose,
-        "phase": np.int8(world.progress.phase),
-        "qpos": world.data.qpos.copy(),
-        "qvel": world.data.qvel.copy(),
-    }
-
-
-def _attributes(env: gymnasium.Env[Any, Any], world: FeedingEnv) -> dict[str, Any]:
-    """Return where the episode came from and how it ended."""
-    if env.spec is None:
-        raise ValueError("the environment must be made by its id, so that it can be made again")
-    segment, progress = world.segment, world.progress
-    joints, actions = world.joint_names, world.action_names
-    return {
-        "env_id": env.spec.id,
-        "env_kwargs": dict(env.spec.kwargs),
-        "is_success": progress.is_success,
-        "is_success_strict": progress.is_success_strict,
-        "completion_time": np.nan if progress.completion_time is None else progress.completion_time,
-        "motion_clip": segment.clip,
-        "motion_subject": segment.subject,
-        "motion_start_index": segment.index,
-        "motion_start_time": segment.start / segment.fps,
-        "face_offset": world.face_offset,
-        "control_period": CONTROL_PERIOD,
-        "prediction_period": FRAME_PERIOD,
-        "phase_names": [phase.name.lower() for phase in Phase],
-        "joint_names": joints,
-        "action_names": actions,
-        "xml_hash": world.xml_hash,
-        "versions": {
-            "python": platform.python_version(),
-            "mujoco": mujoco.__version__,
-            "numpy": np.__version__,
-            "robo_manip_baselines": version("robo_manip_baselines"),
-        },
-    }
+    arrays = {name: np.asarray(values) for name, values in rows.items()}
+    return Demonstration(arrays, images, attributes)
 
 
 SUMMARY = "summary.json"
@@ -189,8 +134,7 @@ class Collection:
     workers: int = 1
 
     def __post_init__(self) -> None:
-        env_id(self.env)
-        require_choice("expert", self.expert, EXPERTS)
+        require_choice("expert", self.expert, task_entry(self.env).experts)
         require_choice("image codec", self.codec, CODECS)
         if self.seeds.start < 0:
             raise RequestError(f"seed {self.seeds.start}: must be 0 or more")
@@ -344,7 +288,7 @@ def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any])
         return
     there = read_metadata(present)
     wanted = {
-        "env_id": env_id(collection.env),
+        "env_id": task_entry(collection.env).env_id,
         # As JSON would give them back: tuples become lists.
         "env_kwargs": json.loads(json.dumps(collection.env_kwargs)),
         "expert": collection.expert,
@@ -362,7 +306,7 @@ def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any])
 
 def _write_summary(collection: Collection, summary: Summary) -> None:
     content = {
-        "env": env_id(collection.env),
+        "env": task_entry(collection.env).env_id,
         "env_kwargs": collection.env_kwargs,
         "expert": collection.expert,
         "first_seed": collection.seeds.start,

@@ -5,19 +5,14 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import tyro
 
-from robo_manip_baselines.envs.mujoco.tasks.registry import ENVS
-from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.spec import (
-    CorruptionOptions,
-    parse_cameras,
-    parse_image_size,
-)
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.policy.presets import PolicyPreset, TrainSettings
 from robo_manip_baselines.policy.registry import POLICIES, load_part, policy_entry
 from robo_manip_baselines.runs.command import parse
@@ -46,14 +41,12 @@ class TrainOptions(Generic[Network]):
     """Settings of the network."""
     training: tyro.conf.OmitArgPrefixes[TrainSettings]
     """Settings of the training."""
-    obs: str = "current_pred"
-    """What is shown: baseline (the robot), current (mouth too), current_pred (its future too)."""
-    horizon: int = 2
-    """Frames of 1/30 s that current_pred looks ahead, 1 to 5."""
-    detection: tyro.conf.OmitArgPrefixes[CorruptionOptions] = field(
-        default_factory=CorruptionOptions
+    spec: tyro.conf.OmitArgPrefixes[ObservationSpec] = field(
+        default_factory=lambda: ObservationSpec("current_pred")
     )
-    """What stands between the true and the shown mouth."""
+    """What the policy is shown."""
+    corruption: bool = True
+    """--no_corruption shows the truth, whatever else is said."""
     env: str = "FeedingEnv"
     """Environment of the demonstrations."""
     dataset: Path | None = None
@@ -62,14 +55,6 @@ class TrainOptions(Generic[Network]):
     """Use only so many demonstrations, the first ones; all if not given."""
     preset: str = "auto"
     """Where the defaults come from: paper, cpu, or auto: paper where there is a GPU, else cpu."""
-    cameras: tuple[str, ...] = ()
-    """Cameras that are shown, or none."""
-    image_size: str = "480x640"
-    """Height x width to which images are scaled, in pixels."""
-    object_pose: bool = False
-    """Show the cube's position."""
-    arms: str = "right"
-    """Arms that the demonstrations move: right or both."""
     seed: int = 0
     """Seed of the weights, of the order of the examples and of the split."""
     device: str = "auto"
@@ -92,37 +77,22 @@ class TrainOptions(Generic[Network]):
 
     def __post_init__(self) -> None:
         require_choice("policy", self.policy, POLICIES)
-        require_choice("environment", self.env, ENVS)
+        task_entry(self.env)
         for name in ("log_every", "validate_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more steps")
         if self.seed < 0:
             raise RequestError(f"seed {self.seed}: must be 0 or more")
-        self.spec  # noqa: B018 — what cannot be shown is refused here
-
-    @property
-    def spec(self) -> ObservationSpec:
-        """What the policy is shown."""
-        return ObservationSpec(
-            obs=self.obs,
-            horizon=self.horizon,
-            cameras=parse_cameras(self.cameras),
-            image_size=parse_image_size(self.image_size),
-            object_pose=self.object_pose,
-            arms=self.arms,
-            corruption=self.detection.apply(),
-        )
+        if not self.corruption:
+            object.__setattr__(self, "spec", replace(self.spec, corruption=Corruption()))
 
     @property
     def folder(self) -> Path:
         """The run folder."""
         if self.out is not None:
             return self.out
-        parts = [self.policy.lower(), self.obs]
-        parts += [f"h{self.horizon}"] if self.obs == "current_pred" else []
-        corruption = self.spec.corruption
-        parts += [corruption.label] if corruption else []
-        return Path("runs") / "_".join([*parts, self.preset, f"seed{self.seed}"])
+        name = f"{self.policy.lower()}_{self.spec.name}_{self.preset}_seed{self.seed}"
+        return Path("runs") / name
 
     @property
     def demonstrations(self) -> Path:
@@ -136,13 +106,26 @@ class TrainOptions(Generic[Network]):
             value = getattr(self, item.name)
             if item.name in ("network", "training"):
                 values |= dataclasses.asdict(value)
-            elif item.name == "detection":
-                values |= {**dataclasses.asdict(value), "error": value.error or "none"}
-                if value.corruption:  # so that older runs, which do not say it, are the same
-                    values.pop("corruption")
-            elif item.name not in _NOT_SAVED:
+            elif item.name == "spec":
+                values |= spec_options(value)
+            elif item.name not in (*_NOT_SAVED, "corruption"):
                 values[item.name] = value
         return {name: _to_yaml(value) for name, value in values.items()}
+
+
+def spec_options(spec: ObservationSpec) -> dict[str, Any]:
+    """Return a spec as options, flat, in the names and forms of the command line."""
+    values = {item.name: getattr(spec, item.name) for item in dataclasses.fields(spec)}
+    corruption = values.pop("corruption")
+    height, width = spec.image_size
+    values |= {"cameras": spec.cameras or ("none",), "image_size": f"{height}x{width}"}
+    # Options of the corruption that are at their defaults are left out, as in older runs.
+    for item in dataclasses.fields(corruption):
+        value = getattr(corruption, item.name)
+        name = "corruption_seed" if item.name == "seed" else item.name
+        if item.name != "stats_sha256":
+            values[name] = value if value != item.default or name == "error" else None
+    return values
 
 
 def parse_options(args: Sequence[str], has_gpu: bool) -> TrainOptions[Any]:
@@ -182,15 +165,17 @@ def parse_options(args: Sequence[str], has_gpu: bool) -> TrainOptions[Any]:
 
 
 def _defaults(policy: str, name: str, preset: PolicyPreset) -> TrainOptions[Any]:
-    height, width = preset.image_size
     return TrainOptions(
         policy=policy,
         preset=name,
         network=preset.config,
         training=preset.training,
-        cameras=preset.cameras or ("none",),
-        image_size=f"{height}x{width}",
-        object_pose=preset.object_pose,
+        spec=ObservationSpec(
+            "current_pred",
+            cameras=preset.cameras,
+            image_size=preset.image_size,
+            object_pose=preset.object_pose,
+        ),
     )
 
 

@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.state import vector_names
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.seeds import derive_seed
@@ -153,9 +152,9 @@ class StateNoise:
     """
 
     def __init__(self, spec: ObservationSpec, robot: float = 0.0, clock: float = 0.0) -> None:
-        names = vector_names(spec)
+        names = spec.vector_names(ObservedNames())
         self._size = len(names)
-        self._felt = len(spec.components()["state"])  # R; they come first
+        self._felt = len(spec.components(ObservedNames())["state"])  # R; they come first
         self._times = [i for i, name in enumerate(names) if name.startswith("t_")]
         self._robot, self._clock = robot, clock
 

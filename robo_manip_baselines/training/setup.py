@@ -17,7 +17,7 @@ from robo_manip_baselines.data.demonstrations import (
     split_episodes,
 )
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.envs.mujoco.tasks.registry import env_id
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.policy.checkpoint import (
     Checkpoint,
     without_initial_weights,
@@ -60,12 +60,11 @@ class Job:
         """
         settings, seed = options.training, options.seed
         given = load_demonstrations(
-            options.demonstrations, options.spec, limit=options.num_episodes
+            options.demonstrations, options.spec, limit=options.num_episodes, env=options.env
         )
-        if given.env_id != env_id(options.env):
-            raise RequestError(
-                f"'{options.demonstrations}' holds {given.env_id}, not {env_id(options.env)}"
-            )
+        env_id = task_entry(options.env).env_id
+        if given.env_id != env_id:
+            raise RequestError(f"'{options.demonstrations}' holds {given.env_id}, not {env_id}")
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = given.indices(split.train)
         rows = given.rows(train)

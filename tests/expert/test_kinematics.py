@@ -11,7 +11,8 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import ARM_JOINTS, HOME_QPOS, JOINT_LIMITS
+from robo_manip_baselines.envs.mujoco.cell.vx300s import (HOME_QPOS, JOINT_LIMITS)
+from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.envs.mujoco.expert.kinematics import (
     ORIENTATION_TOLERANCE,
     POSITION_TOLERANCE,
