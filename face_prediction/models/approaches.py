@@ -155,6 +155,7 @@ class ApproachModel(PredictorModel):
     """Image encoder, Transformer over time, image decoder; subclasses define `tokens`."""
 
     positions: Tensor
+    landmark_decoder: LandmarkDecoder | None
 
     def __init__(self, settings: ApproachSettings) -> None:
         super().__init__()
@@ -163,6 +164,7 @@ class ApproachModel(PredictorModel):
         self.needs = PictureNeeds(frames=settings.history, size=settings.size)
         self.span = 1
         self.makes_images = True
+        self.landmark_decoder, self.landmark_weight = None, 0.0
         self.image_encoder = ImageEncoder(settings.size, settings.channels, settings.width)
         self.future = nn.Parameter(0.02 * torch.randn(settings.horizon, settings.width))
         positions = sinusoids(settings.history + settings.horizon, settings.width)
@@ -192,26 +194,27 @@ class ApproachModel(PredictorModel):
     def decode(
         self, landmarks: Tensor, features: Tensor, last_image: Tensor, make_images: bool = True
     ) -> Output:
-        """Predict images; see `PredictorModel.decode`."""
-        tokens = self._future_tokens(landmarks, features)
-        return Output(images=self.image_decoder(tokens) if make_images else None)
-
-    def loss(self, history: History, future: Future) -> Losses:
-        """Return the mean squared error of the images."""
-        loss = self._image_loss(self(history).images, future)
-        return Losses(loss, {"image": loss.detach()})
-
-    def _future_tokens(self, landmarks: Tensor, features: Tensor) -> Tensor:
-        """Return the Transformer's output (B, H, D) for the future frames."""
+        """Predict images, and landmarks if this approach does; see `PredictorModel.decode`."""
         tokens = self.tokens(landmarks, features)
         future = tokens[:, -1:] + self.future.to(tokens.dtype)
         out: Tensor = self.transformer(torch.cat([tokens, future], dim=1) + self.positions)
-        return out[:, -self.horizon :]
+        out = out[:, -self.horizon :]  # (B, H, D)
+        return Output(
+            landmarks=self.landmark_decoder(out).float() if self.landmark_decoder else None,
+            images=self.image_decoder(out) if make_images else None,
+        )
 
-    def _image_loss(self, images: Tensor, future: Future) -> Tensor:
-        """Return Loss_img of equation 5, of images (B, H, 3, S, S)."""
-        truth = future.images.permute(0, 1, 4, 2, 3).float() / 255
-        return functional.mse_loss(images.float(), truth)
+    def loss(self, history: History, future: Future) -> Losses:
+        """Return equation 5: the errors squared and averaged over all their numbers."""
+        output = self(history)
+        images = future.images.permute(0, 1, 4, 2, 3).float() / 255
+        total = functional.mse_loss(output.images.float(), images)
+        terms = {"image": total.detach()}
+        if output.landmarks is not None:
+            landmark = functional.mse_loss(output.landmarks, future.landmarks)
+            total = total + self.landmark_weight * landmark
+            terms["landmark"] = landmark.detach()
+        return Losses(total, terms)
 
 
 class ImageOnlyModel(ApproachModel):
@@ -227,7 +230,7 @@ class FusionModel(ApproachModel):
 
     def __init__(self, settings: FusionSettings) -> None:
         super().__init__(settings)
-        self._landmark_weight = settings.landmark_weight
+        self.landmark_weight = settings.landmark_weight
         self.landmark_encoder = LandmarkEncoder(settings.landmark_width)
         self.landmark_decoder = LandmarkDecoder(settings.width, settings.feedforward)
 
@@ -240,29 +243,11 @@ class FusionModel(ApproachModel):
         """Take the mean face and the landmarks' spread from all training frames."""
         landmarks = torch.as_tensor(sequences.landmarks, dtype=torch.float32)
         self.landmark_encoder.set_statistics(landmarks.flatten(0, 1))
-        self.landmark_decoder.out.bias.copy_(self.landmark_encoder.mean)
+        self.get_parameter("landmark_decoder.out.bias").copy_(self.landmark_encoder.mean)
 
     def tokens(self, landmarks: Tensor, features: Tensor) -> Tensor:
         """Return the fused features."""
         return self.fuse(self.landmark_encoder(landmarks), features)
-
-    def decode(
-        self, landmarks: Tensor, features: Tensor, last_image: Tensor, make_images: bool = True
-    ) -> Output:
-        """Predict landmarks and images; see `PredictorModel.decode`."""
-        tokens = self._future_tokens(landmarks, features)
-        return Output(
-            landmarks=self.landmark_decoder(tokens).float(),
-            images=self.image_decoder(tokens) if make_images else None,
-        )
-
-    def loss(self, history: History, future: Future) -> Losses:
-        """Return equation 5: both errors squared and averaged over all their numbers."""
-        output = self(history)
-        image = self._image_loss(output.images, future)
-        landmark = functional.mse_loss(output.landmarks, future.landmarks)
-        total = image + self._landmark_weight * landmark
-        return Losses(total, {"image": image.detach(), "landmark": landmark.detach()})
 
 
 class SimpleFusionModel(FusionModel):

@@ -28,8 +28,7 @@ except ModuleNotFoundError:
         "networks need safetensors; pip install 'robo_manip_baselines[face-prediction]'"
     ) from None
 
-SCHEMA = "face_predictor"
-VERSION = 1
+KIND = {"schema": "face_predictor", "version": 1}
 MODEL_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 
@@ -75,9 +74,8 @@ def save_predictor_checkpoint(
     Raises:
         RequestError: the folder cannot be written to.
     """
-    kind = {"schema": SCHEMA, "version": VERSION}
-    digest = write_tensors(folder / MODEL_FILE, state, kind)
-    write_json(folder / CONFIG_FILE, {**kind, **asdict(record), "model_sha256": digest})
+    digest = write_tensors(folder / MODEL_FILE, state, KIND)
+    write_json(folder / CONFIG_FILE, {**KIND, **asdict(record), "model_sha256": digest})
 
 
 def read_predictor_checkpoint(folder: Path) -> tuple[CheckpointRecord, dict[str, Tensor]]:
@@ -90,7 +88,7 @@ def read_predictor_checkpoint(folder: Path) -> tuple[CheckpointRecord, dict[str,
     path = folder / CONFIG_FILE
     _require_file(path)
     data = read_json(path)
-    require_schema(path, data, SCHEMA, VERSION)
+    require_kind(path, data, KIND)
     try:
         record = CheckpointRecord(**{x.name: data[x.name] for x in fields(CheckpointRecord)})
         expected = data["model_sha256"]
@@ -178,16 +176,16 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     return tensors, record, digest
 
 
-def require_schema(path: Path, data: Mapping[str, Any], schema: str, version: int) -> None:
-    """Check the schema of a file's record.
+def require_kind(path: Path, record: Mapping[str, Any], kind: Mapping[str, Any]) -> None:
+    """Check the schema and version in a file's record.
 
     Raises:
         RequestError: it is of another schema or version.
     """
-    found = data.get("schema"), data.get("version")
-    if found != (schema, version):
+    if any(record.get(key) != value for key, value in kind.items()):
         raise RequestError(
-            f"{path}: schema '{found[0]}' version {found[1]}, expected '{schema}' {version}"
+            f"{path}: schema '{record.get('schema')}' version {record.get('version')}, expected "
+            f"'{kind['schema']}' {kind['version']}"
         )
 
 

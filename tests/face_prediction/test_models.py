@@ -170,8 +170,7 @@ def test_features_are_of_one_frame_each(name: str) -> None:
     with torch.no_grad():
         together = model.encode(seen.landmarks, seen.images)
         singly = [
-            model.encode(seen.landmarks[:, t : t + 1], seen.images[:, t : t + 1])
-            for t in range(6)
+            model.encode(seen.landmarks[:, t : t + 1], seen.images[:, t : t + 1]) for t in range(6)
         ]
         output = model.decode(seen.landmarks, together, seen.images[:, -1])
         whole = model(seen)

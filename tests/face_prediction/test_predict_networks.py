@@ -70,7 +70,9 @@ def trained(tmp_path: Path, dataset: Path) -> Callable[..., Path]:
             }
         )
         folder = tmp_path / (name or f"{model}_{fold}")
-        save_predictor_checkpoint(folder, record, make_predictor_model(model, settings).state_dict())
+        save_predictor_checkpoint(
+            folder, record, make_predictor_model(model, settings).state_dict()
+        )
         return folder
 
     return save
