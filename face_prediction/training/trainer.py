@@ -143,7 +143,7 @@ class PredictorTrainer:
         """
         options, settings, seed = self._options, self._settings, self._options.seed
         model, optimizer, progress = self._model, self._optimizer, self.progress
-        clock = StepProgress(
+        bar = StepProgress(
             settings.steps,
             progress.step,
             progress.seconds,
@@ -154,8 +154,8 @@ class PredictorTrainer:
             self._windows, settings.batch_size, seed, progress.step, settings.steps
         )
         log = MetricsLog(options.folder / METRICS_FILE, progress.step, board=None)
-        self._save(clock.seconds)
-        with clock, log, contextlib.closing(batches):
+        with bar, log, contextlib.closing(batches):
+            self._save(bar.seconds)
             for batch in batches:
                 step = progress.step
                 moved = batch.to(self._device)
@@ -175,21 +175,21 @@ class PredictorTrainer:
                 self._means.add({"loss": losses.total, **losses.terms, "gradient": norm})
 
                 progress.step += 1
-                clock.advance()
+                bar.advance()
                 is_stopping = stop.is_made
-                if clock.is_due(options.log_every):
+                if bar.is_due(options.log_every):
                     numbers = self._means.take()
                     self._require_finite(numbers["loss"])
                     rate = settings.learning_rate_at(step)
-                    numbers |= {"learning_rate": rate, "seconds": clock.seconds}
+                    numbers |= {"learning_rate": rate, "seconds": bar.seconds}
                     log.write("train", progress.step, numbers)
-                    clock.report(numbers["loss"])
-                if self._validation and clock.is_due(settings.validate_every):
+                    bar.report(numbers["loss"])
+                if self._validation and bar.is_due(settings.validate_every):
                     numbers = self._validation(self.average or model, self._autocast)
                     log.write("validation", progress.step, numbers)
                     self._keep_best(numbers)
-                if clock.is_due(options.checkpoint_every) or is_stopping:
-                    self._save(clock.seconds)
+                if bar.is_due(options.checkpoint_every) or is_stopping:
+                    self._save(bar.seconds)
                 if is_stopping:
                     break
 
