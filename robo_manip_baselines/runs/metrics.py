@@ -197,7 +197,7 @@ def write_curves(
         axes.set_xlabel("step")
         axes.set_ylabel(panel)
         axes.grid(True, which="both", alpha=0.3)
-        if validation and (place == 0 or len(names) > 1):
+        if axes.lines and validation and (place == 0 or len(names) > 1):
             axes.legend()
     figure.suptitle(title)
     with atomic_file(path) as temporary:

@@ -8,6 +8,7 @@ import os
 import signal
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -222,9 +223,9 @@ class TestMetrics:
         pytest.importorskip("matplotlib", reason="matplotlib is not installed")
         path = tmp_path / "curves.png"
         assert not write_curves(path, [], "run", CURVES)
-        lines = [{"kind": "train", "step": 10, "loss": 0.5}]
+        lines: list[dict[str, Any]] = [{"kind": "train", "step": 10, "loss": -0.5}]
         if is_held_out:
-            lines.append({"kind": "validation", "step": 10, "loss": 0.5, "mouth_error": 0.1})
+            lines.append({"kind": "validation", "step": 10, "loss": -0.5, "mouth_error": 0.1})
         assert write_curves(path, lines, "run", CURVES)
         assert path.read_bytes().startswith(b"\x89PNG")
 
