@@ -79,10 +79,7 @@ class LearnedPredictor:
         return self.record.folds["test"][0]
 
     def predict(
-        self,
-        landmarks: NDArray[np.floating],
-        pictures: NDArray[np.uint8] | None,
-        horizon: int,
+        self, landmarks: NDArray[np.floating], pictures: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
         """Predict the next ``horizon`` frames; see `Predictor.predict`.
 

@@ -289,10 +289,7 @@ def result_step(progress: TrainerProgress) -> int:
 
 
 def save_result(
-    folder: Path,
-    record: CheckpointRecord,
-    tensors: Mapping[str, Tensor],
-    progress: TrainerProgress,
+    folder: Path, record: CheckpointRecord, tensors: Mapping[str, Tensor], progress: TrainerProgress
 ) -> None:
     """Write the network of `result_step` from a trainer's tensors; the last one is averaged."""
     state = _without("best/", tensors)
