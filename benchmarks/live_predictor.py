@@ -32,7 +32,7 @@ from face_prediction.live.streaming import (
     StreamingPredictor,
 )
 from face_prediction.models.interface import History, PredictorModel
-from face_prediction.models.settings import MODELS, PRESETS, make_model, preset_settings
+from face_prediction.models.settings import MODELS, PRESETS, make_predictor_model, preset_settings
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 IMAGE = (640, 480)
@@ -123,7 +123,7 @@ def row(name: str, preset: str, frames: int) -> str:
         ours = streamed(LandmarkForecasting(_persistence(), 5), frames)
         return f"| {name} | | | {_cells(ours)} | | |"
     torch.manual_seed(0)
-    network = make_model(name, preset_settings(name, preset)[0]).eval()
+    network = make_predictor_model(name, preset_settings(name, preset)[0]).eval()
     needs = network.needs
     ours = streamed(NetworkForecasting(network, name), frames)
     theirs = whole(network, max(frames // 5, 4))

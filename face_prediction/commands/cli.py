@@ -22,7 +22,7 @@ from face_prediction.commands.extract import ExtractOptions, run_extract
 from face_prediction.commands.live import LiveOptions, run_live
 from face_prediction.commands.predict import PredictOptions, run_predict
 from face_prediction.commands.train import run_train
-from face_prediction.training.options import TrainOptions
+from face_prediction.training.options import FaceTrainOptions
 from robo_manip_baselines.runs.errors import RequestError
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -46,7 +46,7 @@ COMMANDS: tuple[tuple[str, type, Callable[[Any], int | None]], ...] = (
     ("export-motion", ExportMotionOptions, run_export_motion),
     ("export-surface", ExportSurfaceOptions, export_surface),
     ("build-dataset", BuildDatasetOptions, run_build_dataset),
-    ("train", TrainOptions, run_train),
+    ("train", FaceTrainOptions, run_train),
     ("evaluate", EvaluateOptions, run_evaluate),
     ("export-stats", ExportStatsOptions, run_export_stats),
     ("predict", PredictOptions, run_predict),

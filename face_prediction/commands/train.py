@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from face_prediction.training.options import TrainOptions
+from face_prediction.training.options import FaceTrainOptions
 from robo_manip_baselines.runs.errors import RequestError
 
 
-def run_train(options: TrainOptions) -> int:
+def run_train(options: FaceTrainOptions) -> int:
     """Train a network, or carry on where training was stopped.
 
     Returns:
-        0, or 130 when it was asked to stop (its state is saved).
+        0, or 130 after a requested stop, whose state is saved.
 
     Raises:
         RequestError: the dataset, the options or the folder cannot be used, or PyTorch is not
             installed.
     """
     try:
-        from face_prediction.training.setup import train  # not at the top: loads torch
+        from face_prediction.training.setup import train_predictor  # not at the top: loads torch
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
         raise RequestError(
             "training needs PyTorch; pip install 'robo_manip_baselines[face-prediction]'"
         ) from None
-    return train(options)
-
-
-__all__ = ["TrainOptions", "run_train"]
+    return train_predictor(options)

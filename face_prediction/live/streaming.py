@@ -355,7 +355,7 @@ class NetworkForecasting:
                 self._tensor(landmarks),
                 torch.cat(features, dim=1),
                 self._tensor(last_picture),
-                make_pictures=False,
+                make_images=False,
             )
         return None if output.landmarks is None else output.landmarks[0].float().cpu().numpy()
 

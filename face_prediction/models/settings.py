@@ -1,12 +1,15 @@
-"""How a network is trained: one frozen record, kept in its checkpoint."""
+"""Settings of the networks and of their training, presets, and the registry of networks.
+
+PyTorch is not imported here: options and ``--help`` need settings only.
+"""
 
 from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -15,117 +18,103 @@ if TYPE_CHECKING:
 
     from face_prediction.models.interface import PredictorModel
 
-
-Schedule = Literal["constant", "cosine"]
+Decay = Literal["constant", "cosine"]
 Precision = Literal["auto", "fp32", "bf16"]
+
+IMAGE_SIZES = (32, 64, 128, 256)
+"""Sides of images that a network can see: 256, and the fractions that JPEG decodes directly."""
+
+
+def _within(default: Any, low: float, high: float) -> Any:
+    """Declare a field for numbers from ``low`` to ``high``."""
+    return field(default=default, metadata={"range": (low, high)})
 
 
 @dataclass(frozen=True)
-class TrainSettings:
-    """Everything that the weights depend on, beside network, data and seed.
+class _CheckedSettings:
+    """Settings whose fields declare what is valid.
 
     Raises:
-        RequestError: a value is out of its range; the message names the option.
+        RequestError: a value is not valid.
     """
 
-    steps: int
-    batch_size: int
-    #: Of Adam; 1e-4 in the paper (IV.B).
-    learning_rate: float = 1e-4
-    #: cosine: down to a hundredth of the learning rate at the last step.
-    schedule: Schedule = "constant"
-    #: Steps over which the learning rate rises from 0.
-    warmup_steps: int = 0
-    #: Longest gradient; 0: any.
-    clip_norm: float = 1.0
-    #: Of the moving average of the weights, which is then validated and kept; 0: none.
-    ema_decay: float = 0.0
-    #: Turn half of the sequences left to right, and make them lighter or darker.
-    augment: bool = False
-    #: auto: bf16 on a GPU, fp32 elsewhere.
-    precision: Precision = "auto"
-    #: Steps between looks at the fold that is held out.
-    validate_every: int = 500
-    #: Sequences of it that are looked at, evenly spread; 0: all.
-    validation_sequences: int = 96
+    given: ClassVar[str]
+    """Format of a name and a value in error messages."""
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("steps", 1, 1_000_000_000),
-            ("batch_size", 1, 65536),
-            ("learning_rate", 0.0, 10.0),
-            ("warmup_steps", 0, 1_000_000_000),
-            ("clip_norm", 0.0, 1e9),
-            ("ema_decay", 0.0, 0.999999),
-            ("validate_every", 1, 1_000_000_000),
-            ("validation_sequences", 0, 1_000_000_000),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise RequestError(f"--{name} {value}: between {low} and {high:g}")
-        for name, choices in (
-            ("schedule", ("constant", "cosine")),
-            ("precision", ("auto", "fp32", "bf16")),
-        ):
-            if getattr(self, name) not in choices:
-                raise RequestError(f"--{name} {getattr(self, name)}: one of {', '.join(choices)}")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            given = self.given.format(item.name, value)
+            low, high = item.metadata.get("range", (-math.inf, math.inf))
+            choices = item.metadata.get("choices", (value,))
+            if value not in choices:
+                raise RequestError(f"{given}: unknown; valid: {', '.join(map(str, choices))}")
+            if isinstance(value, (int, float)) and not low <= value <= high:
+                raise RequestError(f"{given}: out of range; valid: {low} to {high:g}")
+
+
+@dataclass(frozen=True)
+class PredictorTrainSettings(_CheckedSettings):
+    """Everything that the weights depend on, beside network, data and seed.
+
+    The defaults are the preset ``paper``: Adam at 1e-4 (paper, IV.B); how long, and on how many
+    sequences at once, the paper does not say.
+
+    Attributes:
+        steps: optimizer steps in all.
+        batch_size: sequences of a step.
+        learning_rate: of Adam.
+        schedule: ``constant``, or ``cosine``: down to a hundredth of the rate at the last step.
+        warmup_steps: steps over which the learning rate rises from 0.
+        clip_norm: largest norm of the gradient; 0 for no clipping.
+        ema_decay: decay of the moving average of the weights, which is then what is validated and
+            kept; 0 for none.
+        augment: mirror half of the sequences, and move and relight all.
+        precision: ``auto`` is bf16 on a GPU, fp32 elsewhere.
+        validate_every: steps between validations on the held-out fold.
+        validation_sequences: sequences of that fold used for it, evenly spread; 0 for all.
+
+    Raises:
+        RequestError: a value is not valid; the message names the option.
+    """
+
+    given: ClassVar[str] = "--{} {}"
+
+    steps: int = _within(20_000, 1, 1e9)
+    batch_size: int = _within(16, 1, 65536)
+    learning_rate: float = _within(1e-4, 0.0, 10.0)
+    schedule: Decay = field(default="constant", metadata={"choices": get_args(Decay)})
+    warmup_steps: int = _within(0, 0, 1e9)
+    clip_norm: float = _within(1.0, 0.0, 1e9)
+    ema_decay: float = _within(0.0, 0.0, 0.999999)
+    augment: bool = False
+    precision: Precision = field(default="auto", metadata={"choices": get_args(Precision)})
+    validate_every: int = _within(500, 1, 1e9)
+    validation_sequences: int = _within(96, 0, 1e9)
 
     def learning_rate_at(self, step: int) -> float:
-        """The learning rate of the step after ``step`` steps."""
+        """Learning rate of the optimizer step that follows ``step`` others."""
         rate = self.learning_rate * min((step + 1) / (self.warmup_steps + 1), 1.0)
         if self.schedule == "cosine":
             done = max(step - self.warmup_steps, 0) / max(self.steps - self.warmup_steps, 1)
             rate *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
         return rate
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values, what `from_json` takes."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, data: Any) -> TrainSettings:
-        """Undo `to_json`.
-
-        Raises:
-            RequestError: other keys, or values that are none of settings.
-        """
-        names = {item.name for item in fields(cls)}
-        if not isinstance(data, dict) or set(data) != names:
-            raise RequestError(f"training settings need the keys {', '.join(sorted(names))}")
-        try:
-            return cls(**data)
-        except TypeError as error:
-            raise RequestError(f"training settings are not as expected ({error})") from None
-
-
-#: Sides of the pictures that a network can be shown: 256 and what JPEG decodes at once.
-PICTURE_SIZES = (32, 64, 128, 256)
-
 
 @dataclass(frozen=True)
-class ModelSettings:
-    """Base of every network's settings: JSON, and values given by name.
+class ModelSettings(_CheckedSettings):
+    """Base of every network's settings. The defaults are the preset ``paper``.
 
-    Every field of a subclass has a default, a plain number, truth value, text or a tuple of
-    whole numbers; what is read back must be of the same kind.
+    Every field of a subclass has a default: a number, a bool, a text or a tuple of integers.
+    Values that are read back must be of the same type.
     """
 
-    #: Values that differ from the defaults, by the name of the preset.
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {}, "cpu": {}}
-
-    @classmethod
-    def preset(cls, name: str) -> Self:
-        """The settings of the preset ``name``.
-
-        Raises:
-            RequestError: there is none of that name.
-        """
-        if name not in cls.presets:
-            raise RequestError(f"--preset {name}: one of {', '.join(cls.presets)}")
-        return cls(**cls.presets[name])
+    given: ClassVar[str] = "setting {}={}"
+    cpu: ClassVar[Mapping[str, Any]] = {}
+    """Values of the preset ``cpu`` that differ."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, what `from_json` takes."""
+        """Return plain values, as `from_json` takes them."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     @classmethod
@@ -133,7 +122,7 @@ class ModelSettings:
         """Undo `to_json`.
 
         Raises:
-            RequestError: other keys, or a value that is none of a setting.
+            RequestError: keys are missing or unknown, or a value is not valid.
         """
         names = {item.name for item in fields(cls)}
         if not isinstance(data, Mapping) or set(data) != names:
@@ -141,229 +130,244 @@ class ModelSettings:
         return cls().changed(data)
 
     def changed(self, values: Mapping[str, Any]) -> Self:
-        """These settings with other values, by name.
+        """Return a copy with other values, by name.
 
         Raises:
-            RequestError: a name or a value is none of these settings.
+            RequestError: a name is unknown, or a value is not valid.
         """
         defaults = {item.name: getattr(self, item.name) for item in fields(self)}
         for name in values:
             if name not in defaults:
-                raise RequestError(f"setting '{name}'; there are {', '.join(defaults)}")
+                raise RequestError(f"setting '{name}': unknown; valid: {', '.join(defaults)}")
         return replace(self, **{k: _like(k, v, defaults[k]) for k, v in values.items()})
 
-    def require(self, name: str, low: float, high: float) -> None:
-        """Check that the number ``name`` is in its range.
-
-        Raises:
-            RequestError: it is not.
-        """
-        value = getattr(self, name)
-        if not low <= value <= high:
-            raise RequestError(f"setting {name}={value}: between {low} and {high}")
-
-    def require_one_of(self, name: str, choices: Sequence[object]) -> None:
-        """Check that ``name`` is one of ``choices``.
-
-        Raises:
-            RequestError: it is not.
-        """
-        value = getattr(self, name)
-        if value not in choices:
-            raise RequestError(f"setting {name}={value}: one of {', '.join(map(str, choices))}")
+    def _require_halvings(self, side: int, channels: tuple[int, ...], least: int) -> None:
+        """Check the ``channels`` of convolutions that each halve an image of ``side`` pixels."""
+        if not channels or min(channels) < 1 or side >> len(channels) < least:
+            raise RequestError(
+                f"setting channels={channels}: not possible; valid: 1 or more channels for each of "
+                f"1 or more halvings of {side} pixels, which leave {least} or more"
+            )
 
 
 def _like(name: str, value: Any, default: Any) -> Any:
-    """``value`` as the type of ``default``, where that changes nothing."""
+    """Convert ``value`` to the type of ``default``, where that changes nothing."""
     if isinstance(default, tuple):
         if isinstance(value, (list, tuple)) and all(type(item) is int for item in value):
             return tuple(value)
-        raise RequestError(f"setting {name}={value}: a list of whole numbers")
+        raise RequestError(f"setting {name}={value}: wrong type; valid: a list of whole numbers")
     if isinstance(default, float) and type(value) is int:
         return float(value)
     if type(value) is not type(default):
-        raise RequestError(f"setting {name}={value}: a {type(default).__name__}, like {default}")
+        kind = type(default).__name__
+        raise RequestError(f"setting {name}={value}: wrong type; valid: {kind}, like {default}")
     return value
 
 
 @dataclass(frozen=True)
 class ApproachSettings(ModelSettings):
-    """What the three published approaches share; image-only prediction needs no more.
+    """Settings that the paper's three approaches share; `ImageOnlyModel` needs no others.
 
-    The paper (IV.A) gives the sizes of pictures, history and horizon and the four layers. Widths,
+    The paper (IV.A) gives the sizes of images, history and horizon and the four layers. Widths,
     heads, the depth of the convolutions and dropout are ours.
 
+    Attributes:
+        size: side of the images in pixels, seen and predicted.
+        channels: of the convolutions, each of which halves the image; the decoder has the same in
+            reverse.
+        width: of the tokens of the Transformer encoder.
+        heads: of the Transformer encoder.
+        layers: of the Transformer encoder.
+        feedforward: hidden width of its feed-forward networks.
+        dropout: in the Transformer encoder.
+        history: frames seen.
+        horizon: frames predicted.
+
     Raises:
-        RequestError: a value is out of its range.
+        RequestError: a value is not valid.
     """
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "paper": {},
-        "cpu": {
-            "size": 64,
-            "channels": (8, 16, 32, 64),
-            "width": 128,
-            "heads": 4,
-            "feedforward": 256,
-            "dropout": 0.0,
-        },
+    cpu: ClassVar[Mapping[str, Any]] = {
+        "size": 64,
+        "channels": (8, 16, 32, 64),
+        "width": 128,
+        "heads": 4,
+        "feedforward": 256,
+        "dropout": 0.0,
     }
 
-    #: Side of the pictures in pixels, seen and predicted.
-    size: int = 256
-    #: Of the convolutions that each halve the picture; the decoder has the same in reverse.
+    size: int = field(default=256, metadata={"choices": IMAGE_SIZES})
     channels: tuple[int, ...] = (32, 64, 128, 256, 256, 256)
-    #: Of the tokens that the Transformer works on.
-    width: int = 512
-    #: Of the Transformer encoder.
-    heads: int = 8
-    layers: int = 4
-    feedforward: int = 2048
-    dropout: float = 0.1
-    #: Frames seen and predicted.
-    history: int = 70
-    horizon: int = 5
+    width: int = _within(512, 2, 8192)
+    heads: int = _within(8, 1, 128)
+    layers: int = _within(4, 1, 64)
+    feedforward: int = _within(2048, 1, 65536)
+    dropout: float = _within(0.1, 0.0, 0.9)
+    history: int = _within(70, 1, 10_000)
+    horizon: int = _within(5, 1, 1000)
 
     def __post_init__(self) -> None:
-        self.require_one_of("size", PICTURE_SIZES)
-        for name, low, high in (
-            ("width", 2, 8192),
-            ("heads", 1, 128),
-            ("layers", 1, 64),
-            ("feedforward", 1, 65536),
-            ("dropout", 0.0, 0.9),
-            ("history", 1, 10_000),
-            ("horizon", 1, 1000),
-        ):
-            self.require(name, low, high)
+        super().__post_init__()
         if self.width % (2 * self.heads):
-            raise RequestError(f"setting width={self.width}: a multiple of 2 heads={self.heads}")
-        if not self.channels or min(self.channels) < 1 or self.size >> len(self.channels) < 2:
             raise RequestError(
-                f"setting channels={self.channels}: 1 or more halvings of {self.size} pixels, "
-                "which leave at least 2, each with 1 or more channels"
+                f"setting width={self.width}: not divisible; valid: a multiple of 2 x "
+                f"heads={self.heads}"
             )
+        self._require_halvings(self.size, self.channels, least=2)
 
 
 @dataclass(frozen=True)
 class FusionSettings(ApproachSettings):
-    """Settings of simple fusion: landmarks come in and go out too."""
+    """Settings of simple fusion, which sees and predicts landmarks, too.
 
-    #: Of the landmark features (D_l of the paper).
-    landmark_width: int = 256
-    #: What the landmarks' error counts beside the picture's (paper, equation 5).
-    landmark_weight: float = 0.5
+    Attributes:
+        landmark_width: of the landmark features (D_l of the paper).
+        landmark_weight: of the landmarks' error in the loss, beside the images' (equation 5).
+    """
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        name: {**values, **({"landmark_width": 64} if name == "cpu" else {})}
-        for name, values in ApproachSettings.presets.items()
-    }
+    cpu: ClassVar[Mapping[str, Any]] = {**ApproachSettings.cpu, "landmark_width": 64}
+
+    landmark_width: int = _within(256, 2, 8192)
+    landmark_weight: float = _within(0.5, 0.0, 1e6)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require("landmark_width", 2, 8192)
         if self.landmark_width % 2:
-            raise RequestError(f"setting landmark_width={self.landmark_width}: an even number")
-        self.require("landmark_weight", 0.0, 1e6)
+            raise RequestError(
+                f"setting landmark_width={self.landmark_width}: odd; valid: an even number"
+            )
 
 
 @dataclass(frozen=True)
 class CrossAttentionSettings(FusionSettings):
-    """Settings of cross-attention fusion."""
+    """Settings of cross-attention fusion.
 
-    #: Of the projected vectors (d of the paper's equation 1).
-    attention_width: int = 256
+    Attributes:
+        attention_width: of queries, keys and values (d of equation 1).
+    """
 
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        name: {**values, **({"attention_width": 128} if name == "cpu" else {})}
-        for name, values in FusionSettings.presets.items()
+    cpu: ClassVar[Mapping[str, Any]] = {**FusionSettings.cpu, "attention_width": 128}
+
+    attention_width: int = _within(256, 1, 8192)
+
+
+@dataclass(frozen=True)
+class ResidualSettings(ModelSettings):
+    """Settings of residual prediction: sizes of the correction, and weights of the loss.
+
+    Attributes:
+        size: side of the images in pixels, seen and predicted.
+        pictures: images seen, the last of the history; each but the first beside its difference to
+            the one before.
+        region: side in pixels of the crops of mouth, eyes and face.
+        channels: of the convolutions over the regions, each of which halves them.
+        width: of the landmarks' code and of the regions' tokens.
+        refiner: channels of the convolutions that refine the warped image.
+        dropout: on the inputs of the layers.
+        shapes: principal shapes of displacement in which landmarks are predicted.
+        history: frames of landmarks that the prior adapts to.
+        recent: frames of landmarks, the last of them, that the network sees.
+        horizon: frames predicted.
+        mouth_weight: of the mouth's absolute error, where the likelihood of it counts 1.
+        landmark_weight: of the absolute error of all landmarks.
+        picture_weight: of the absolute error of the images.
+
+    Raises:
+        RequestError: a value is not valid.
+    """
+
+    cpu: ClassVar[Mapping[str, Any]] = {
+        "size": 128,
+        "region": 24,
+        "channels": (12, 24, 48),
+        "width": 48,
+        "refiner": 12,
     }
+
+    size: int = field(default=256, metadata={"choices": IMAGE_SIZES})
+    pictures: int = _within(4, 2, 64)
+    region: int = _within(48, 8, 256)
+    channels: tuple[int, ...] = (32, 64, 128)
+    width: int = _within(128, 4, 4096)
+    refiner: int = _within(32, 1, 1024)
+    dropout: float = _within(0.2, 0.0, 0.9)
+    shapes: int = _within(8, 2, 64)
+    history: int = _within(64, 16, 10_000)
+    recent: int = _within(32, 2, 10_000)
+    horizon: int = _within(5, 1, 30)
+    mouth_weight: float = _within(1.0, 0.0, 1e6)
+    landmark_weight: float = _within(0.3, 0.0, 1e6)
+    picture_weight: float = _within(10.0, 0.0, 1e6)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require("attention_width", 1, 8192)
+        for name in ("recent", "pictures"):
+            if getattr(self, name) > self.history:
+                raise RequestError(
+                    f"setting {name}={getattr(self, name)}: too many; valid: at most "
+                    f"history={self.history}"
+                )
+        self._require_halvings(self.region, self.channels, least=1)
 
 
-_PACKAGE = "face_prediction.models"
-#: name -> where its settings are (without torch), and the network that is made from them
-MODELS: dict[str, tuple[str, str]] = {
-    "image_only": ("settings:ApproachSettings", "approaches:ImageOnlyModel"),
-    "simple_fusion": ("settings:FusionSettings", "approaches:SimpleFusionModel"),
-    "cross_attention": ("settings:CrossAttentionSettings", "approaches:CrossAttentionModel"),
-    "residual": ("residual.settings:ResidualSettings", "residual.model:ResidualModel"),
+MODELS: dict[str, tuple[type[ModelSettings], str]] = {
+    "image_only": (ApproachSettings, "approaches:ImageOnlyModel"),
+    "simple_fusion": (FusionSettings, "approaches:SimpleFusionModel"),
+    "cross_attention": (CrossAttentionSettings, "approaches:CrossAttentionModel"),
+    "residual": (ResidualSettings, "residual.model:ResidualModel"),
 }
-
-
-def settings_class(name: str) -> type[ModelSettings]:
-    """The class of the settings of the network called ``name``.
-
-    Raises:
-        RequestError: there is none of that name.
-    """
-    kind: type[ModelSettings] = _load(_entry(name)[0])
-    return kind
-
-
-def make_model(name: str, settings: ModelSettings) -> PredictorModel:
-    """The network called ``name``, with weights drawn from torch's generator.
-
-    Raises:
-        RequestError: there is none of that name.
-    """
-    model: PredictorModel = _load(_entry(name)[1])(settings)
-    return model
-
-
-def _entry(name: str) -> tuple[str, str]:
-    if name not in MODELS:
-        raise RequestError(f"model '{name}'; there are {', '.join(MODELS)}")
-    return MODELS[name]
-
-
-def _load(place: str) -> Any:
-    module, _, attribute = place.partition(":")
-    return getattr(importlib.import_module(f"{_PACKAGE}.{module}"), attribute)
-
+"""Settings of every network, and the module and class that are loaded when it is made."""
 
 PRESETS = ("paper", "cpu")
 
-#: The paper's training is Adam at 1e-4 (IV.B); how long, on how many sequences at once, it does
-#: not say. The cpu preset has minutes: it needs larger steps, and a schedule that ends them.
-_TRAINING = {
-    "paper": TrainSettings(steps=20_000, batch_size=16, learning_rate=1e-4, augment=False),
-    "cpu": TrainSettings(
-        steps=1600,
-        batch_size=4,
-        learning_rate=1e-3,
-        schedule="cosine",
-        warmup_steps=100,
-        augment=True,
-        validate_every=400,
-    ),
-}
-#: Where a network is trained otherwise than the three published approaches.
-_TRAINING_OF: dict[tuple[str, str], TrainSettings] = {
-    # a step holds eleven origins of each sequence; what is learnt is small beside the fitted prior
-    ("residual", "cpu"): TrainSettings(
-        steps=500,
-        batch_size=16,
-        learning_rate=1e-3,
-        schedule="cosine",
-        warmup_steps=50,
-        ema_decay=0.99,
-        augment=True,
-        validate_every=100,
-    ),
-}
+# The cpu preset has minutes: it needs larger steps, and a schedule that ends them.
+_CPU_TRAINING = PredictorTrainSettings(
+    steps=1600,
+    batch_size=4,
+    learning_rate=1e-3,
+    schedule="cosine",
+    warmup_steps=100,
+    augment=True,
+    validate_every=400,
+)
+# A step has eleven origins of each sequence; what is learnt is small beside the fitted prior.
+_CPU_RESIDUAL_TRAINING = replace(
+    _CPU_TRAINING, steps=500, batch_size=16, warmup_steps=50, ema_decay=0.99, validate_every=100
+)
 
 
-def preset_settings(model: str, preset: str) -> tuple[ModelSettings, TrainSettings]:
-    """Settings of network and training.
+def settings_class(model: str) -> type[ModelSettings]:
+    """Return the class of a network's settings.
 
     Raises:
-        RequestError: there is no such network or preset.
+        RequestError: the network is unknown.
     """
+    if model not in MODELS:
+        raise RequestError(f"model '{model}': unknown; valid: {', '.join(MODELS)}")
+    return MODELS[model][0]
+
+
+def make_predictor_model(model: str, settings: ModelSettings) -> PredictorModel:
+    """Make a network, with weights drawn from torch's generator.
+
+    Raises:
+        RequestError: the network is unknown.
+    """
+    settings_class(model)
+    module, _, kind = MODELS[model][1].partition(":")
+    return getattr(importlib.import_module(f"face_prediction.models.{module}"), kind)(settings)
+
+
+def preset_settings(model: str, preset: str) -> tuple[ModelSettings, PredictorTrainSettings]:
+    """Return the settings of a network and of its training.
+
+    Raises:
+        RequestError: the network or the preset is unknown.
+    """
+    settings = settings_class(model)
     if preset not in PRESETS:
-        raise RequestError(f"--preset {preset}: one of {', '.join(PRESETS)}")
-    training = _TRAINING_OF.get((model, preset), _TRAINING[preset])
-    return settings_class(model).preset(preset), training
+        raise RequestError(f"--preset {preset}: unknown; valid: {', '.join(PRESETS)}")
+    if preset == "paper":
+        return settings(), PredictorTrainSettings()
+    training = _CPU_RESIDUAL_TRAINING if model == "residual" else _CPU_TRAINING
+    return settings(**settings.cpu), training

@@ -1,195 +1,308 @@
-"""The loop: batches through `TrainStep`, and what is written on the way."""
+"""The training loop, and the state that it saves to go on exactly.
+
+``trainer.safetensors`` holds ``weights/NAME``, ``average/NAME`` (with a moving average),
+``best/NAME`` (once a held-out fold has chosen), Adam's moments ``adam/NAME/...``, and a record:
+what is trained, and `TrainerProgress`.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
+import copy
 import logging
 import math
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from torch import Tensor
-from tqdm import tqdm
+import torch
+from torch import Tensor, nn
 
-from face_prediction.models.checkpoint import CheckpointRecord, save_checkpoint
-from face_prediction.models.settings import TrainSettings
-from face_prediction.training.metrics import MetricsLog, RunningMean
-from face_prediction.training.step import Progress, TrainStep, save_state
-from face_prediction.training.validation import Validation, selection_error
-from face_prediction.training.windows import Sampler, Windows, batches
+from face_prediction.models.checkpoint import (
+    CheckpointRecord,
+    load_tensors,
+    read_tensors,
+    require_kind,
+    save_predictor_checkpoint,
+    write_tensors,
+)
+from face_prediction.models.interface import PredictorModel
+from face_prediction.models.settings import PredictorTrainSettings
+from face_prediction.training.options import FaceTrainOptions
+from face_prediction.training.validation import HeldOutLoss, selection_error
+from face_prediction.training.windows import SequenceWindows, augment, window_batches
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.interrupt import StopRequest
+from robo_manip_baselines.runs.metrics import MetricsLog
+from robo_manip_baselines.runs.progress import StepProgress
+from robo_manip_baselines.runs.seeds import stream_generator
+
+KIND = {"schema": "face_trainer", "version": 1}
+TRAINER_FILE = "trainer.safetensors"
+METRICS_FILE = "metrics.jsonl"
 
 logger = logging.getLogger(__name__)
 
-#: Lines about progress where there is no terminal for a bar.
-_LINES = 10
+
+@dataclass
+class TrainerProgress:
+    """How far a run has come.
+
+    Attributes:
+        step: optimizer steps done.
+        seconds: spent on them, by all processes in turn.
+        names: of the numbers of a step.
+        rows: numbers of the steps since the last line of ``metrics.jsonl``.
+        best_step: step whose weights did best on the held-out fold.
+        best: their losses and errors on it.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    names: list[str] = field(default_factory=list)
+    rows: list[list[float]] = field(default_factory=list)
+    best_step: int | None = None
+    best: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Pace:
-    """How often something is said and saved; nothing that is trained depends on it."""
-
-    log_every: int = 20
-    checkpoint_every: int = 200
-    progress: bool = True
-
-
-class Trainer:
-    """Trains until all steps are done or somebody asks to stop.
+class StepMeans:
+    """Means over steps of numbers that stay on the device until they are needed.
 
     Args:
-        folder: of the run.
-        record: what is trained; ``step`` and ``validation`` are filled in.
+        names: of the numbers.
+        rows: of earlier steps, as `rows` gave them.
+    """
+
+    def __init__(self, names: Sequence[str] = (), rows: Sequence[Sequence[float]] = ()) -> None:
+        self.names = list(names)
+        self._rows = [list(row) for row in rows]
+        self._pending: list[Tensor] = []
+
+    def add(self, numbers: Mapping[str, Tensor]) -> None:
+        """Add the numbers of a step."""
+        self.names = list(numbers)
+        self._pending.append(torch.stack([value.detach().double() for value in numbers.values()]))
+
+    def rows(self) -> list[list[float]]:
+        """Return the numbers of every step since the last `take`."""
+        if self._pending:
+            self._rows += torch.stack(self._pending).tolist()
+            self._pending.clear()
+        return self._rows
+
+    def take(self) -> dict[str, float]:
+        """Return the means by name, and begin new ones."""
+        columns, self._rows = list(zip(*self.rows(), strict=True)), []
+        return {n: math.fsum(c) / len(c) for n, c in zip(self.names, columns, strict=True)}
+
+
+class PredictorTrainer:
+    """Trains a network until all steps are done or a stop is requested.
+
+    Args:
+        options: of the command.
         settings: of training.
-        train_step: with the network.
+        record: what is trained on what; ``step`` and ``validation`` are filled in.
+        model: on its device, prepared.
         windows: to train on.
-        sampler: which of them when.
-        validation: None: nobody is held out, and the last weights are the result.
+        validation: on the held-out fold; None: nobody is held out, and the last weights are kept.
+
+    Attributes:
+        average: network with the moving average of the weights, or None.
         progress: how far the run has come.
-        best: weights that did best so far, where somebody is held out.
-        pace: how often something is said and saved.
-        stop: whether to stop after this step.
     """
 
     def __init__(
         self,
-        folder: Path,
+        options: FaceTrainOptions,
+        settings: PredictorTrainSettings,
         record: CheckpointRecord,
-        settings: TrainSettings,
-        train_step: TrainStep,
-        windows: Windows,
-        sampler: Sampler,
-        validation: Validation | None,
-        progress: Progress,
-        best: dict[str, Tensor],
-        pace: Pace,
-        stop: Callable[[], bool],
+        model: PredictorModel,
+        windows: SequenceWindows,
+        validation: HeldOutLoss | None,
     ) -> None:
-        self._folder = folder
-        self._record = record
-        self._settings = settings
-        self._train_step = train_step
-        self._windows = windows
-        self._sampler = sampler
-        self._validation = validation
-        self._progress = progress
-        self._best = best
-        self._pace = pace
-        self._stop = stop
-        self._mean = RunningMean(progress.names, progress.rows)
-        self._saved_step = progress.step
-        self._seconds_before = progress.seconds
-        self._start = time.perf_counter()
+        self.average = copy.deepcopy(model).eval() if settings.ema_decay else None
+        self.progress = TrainerProgress()
+        self._options, self._settings, self._record = options, settings, record
+        self._model, self._windows, self._validation = model, windows, validation
+        self._optimizer = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
+        self._device = next(model.parameters()).device
+        precisions = ("auto", "bf16") if self._device.type == "cuda" else ("bf16",)
+        is_half = settings.precision in precisions
+        self._autocast = torch.autocast(self._device.type, torch.bfloat16, enabled=is_half)
+        self._means = StepMeans()
+        self._best: Mapping[str, Tensor] = {}
+        self._saved_step = 0
 
-    def train(self) -> None:
+    def train(self, stop: StopRequest) -> None:
         """Run the loop.
 
         Raises:
-            RequestError: a picture is damaged, or the loss is not finite any more.
+            RequestError: an image is damaged, or the loss is not finite any more.
         """
-        self._start = time.perf_counter()
-        first, total = self._progress.step, self._settings.steps
-        log = MetricsLog(self._folder, first)
-        bar = tqdm(
-            total=total,
-            initial=first,
-            unit="step",
-            dynamic_ncols=True,
-            smoothing=0.0,  # the mean over all steps: looks at the held-out fold are in it
-            disable=None if self._pace.progress else True,
+        options, settings, seed = self._options, self._settings, self._options.seed
+        model, optimizer, progress = self._model, self._optimizer, self.progress
+        bar = StepProgress(
+            settings.steps,
+            progress.step,
+            progress.seconds,
+            shown=options.progress,
+            log_every=options.log_every,
         )
-        with bar, batches(self._windows, self._sampler, first, total) as following:
-            for batch in following:
-                self._mean.add(self._train_step(batch, self._progress.step))
-                self._progress.step += 1
-                bar.update()
-                if self._after_step(log, bar):
-                    return
+        batches = window_batches(
+            self._windows, settings.batch_size, seed, progress.step, settings.steps
+        )
+        log = MetricsLog(options.folder / METRICS_FILE, progress.step, board=None)
+        with bar, log, contextlib.closing(batches):
+            self._save(bar.seconds)
+            for batch in batches:
+                step = progress.step
+                moved = batch.to(self._device)
+                if settings.augment:
+                    moved = augment(moved, stream_generator(seed, "augment", step))
+                for group in optimizer.param_groups:
+                    group["lr"] = settings.learning_rate_at(step)
+                torch.manual_seed(torch_seed(seed, "dropout", step))
+                model.train()
+                with self._autocast:
+                    losses = model.loss(*moved)
+                optimizer.zero_grad(set_to_none=True)
+                losses.total.backward()
+                norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip_norm or math.inf)
+                optimizer.step()
+                self._update_average(step)
+                self._means.add({"loss": losses.total, **losses.terms, "gradient": norm})
 
-    def save(self) -> None:
-        """Write the trainer's state, and the network that is the result so far."""
-        self._progress.names = list(self._mean.names)
-        self._progress.rows = self._mean.rows()
-        self._progress.seconds = self._seconds()
-        self._require_finite(sum(row[0] for row in self._progress.rows))
-        run = run_record(self._record)
-        save_state(self._folder, run, self._train_step, self._progress, self._best)
-        self._saved_step = self._progress.step
-        self.export()
+                progress.step += 1
+                bar.advance()
+                is_stopping = stop.is_made
+                if bar.is_due(options.log_every):
+                    numbers = self._means.take()
+                    self._require_finite(numbers["loss"])
+                    rate = settings.learning_rate_at(step)
+                    numbers |= {"learning_rate": rate, "seconds": bar.seconds}
+                    log.write("train", progress.step, numbers)
+                    bar.report(numbers["loss"])
+                if self._validation and bar.is_due(settings.validate_every):
+                    numbers = self._validation(self.average or model, self._autocast)
+                    log.write("validation", progress.step, numbers)
+                    self._keep_best(numbers)
+                if bar.is_due(options.checkpoint_every) or is_stopping:
+                    self._save(bar.seconds)
+                if is_stopping:
+                    break
 
-    def export(self) -> None:
-        """Write ``model.safetensors`` and ``config.json``, if there is a result yet."""
-        if self._validation is None:
-            state, step, numbers = (
-                self._train_step.result.state_dict(),
-                self._progress.step,
-                {},
-            )
-        elif self._progress.best_step is not None:
-            state, step, numbers = self._best, self._progress.best_step, self._progress.best
-        else:
+    @torch.no_grad()
+    def restore(self, tensors: Mapping[str, Tensor], progress: TrainerProgress) -> None:
+        """Go on from where another trainer was, as `read_trainer_state` returns it.
+
+        Raises:
+            RequestError: the tensors do not fit the network.
+        """
+        path = self._options.folder / TRAINER_FILE
+        load_tensors(self._model, _without("weights/", tensors), path)
+        if self.average is not None:
+            load_tensors(self.average, _without("average/", tensors), path)
+        for name, parameter in self._model.named_parameters():
+            if moments := _without(f"adam/{name}/", tensors):
+                self._optimizer.state[parameter] = {
+                    # Adam keeps its count of steps on the CPU
+                    key: value if key == "step" else value.to(parameter.device)
+                    for key, value in moments.items()
+                }
+        self._best = _without("best/", tensors)
+        self._means = StepMeans(progress.names, progress.rows)
+        self.progress = progress
+        self._saved_step = progress.step
+
+    @torch.no_grad()
+    def _update_average(self, step: int) -> None:
+        if self.average is None:
             return
-        record = dataclasses.replace(self._record, step=step, validation=numbers)
-        save_checkpoint(self._folder, record, state)
-
-    def _after_step(self, log: MetricsLog, bar: tqdm) -> bool:
-        """Write what is due; return whether to stop."""
-        step = self._progress.step
-        is_stopping = self._stop()
-        if self._is_due(self._pace.log_every):
-            numbers = self._mean.take()
-            self._require_finite(numbers["loss"])
-            rate = self._settings.learning_rate_at(step - 1)
-            log.write("train", step, {**numbers, "learning_rate": rate, "seconds": self._seconds()})
-            bar.set_postfix(loss=f"{numbers['loss']:.4g}", refresh=False)
-            self._say_progress(bar, numbers["loss"])
-        if self._validation and self._is_due(self._settings.validate_every):
-            numbers = self._validation(self._train_step)
-            log.write("validation", step, numbers)
-            self._keep_best(numbers)
-        if self._is_due(self._pace.checkpoint_every) or is_stopping:
-            self.save()
-        return is_stopping
+        decay = min(self._settings.ema_decay, (1 + step) / (10 + step))  # short at first
+        for mean, new in zip(self.average.parameters(), self._model.parameters(), strict=True):
+            mean.lerp_(new, 1 - decay)
+        for mean, new in zip(self.average.buffers(), self._model.buffers(), strict=True):
+            mean.copy_(new)
 
     def _keep_best(self, numbers: dict[str, float]) -> None:
-        self._require_finite(selection_error(numbers))
-        progress = self._progress
-        if progress.best_step is None or selection_error(numbers) < selection_error(progress.best):
+        error = selection_error(numbers)
+        self._require_finite(error)
+        progress = self.progress
+        if progress.best_step is None or error < selection_error(progress.best):
             progress.best_step, progress.best = progress.step, numbers
-            state = self._train_step.result.state_dict()
+            state = (self.average or self._model).state_dict()
             self._best = {name: tensor.detach().clone() for name, tensor in state.items()}
 
-    def _is_due(self, interval: int) -> bool:
-        step = self._progress.step
-        return step % interval == 0 or step == self._settings.steps
+    def _save(self, seconds: float) -> None:
+        """Write the trainer's state, and the network that is the result so far."""
+        progress = self.progress
+        progress.names, progress.rows = self._means.names, self._means.rows()
+        progress.seconds = seconds
+        self._require_finite(sum(row[0] for row in progress.rows))
+        tensors = _prefixed("weights/", self._model.state_dict())
+        if self.average is not None:
+            tensors |= _prefixed("average/", self.average.state_dict())
+        tensors |= _prefixed("best/", self._best)
+        for name, parameter in self._model.named_parameters():
+            tensors |= _prefixed(f"adam/{name}/", self._optimizer.state.get(parameter, {}))
+        record = {**KIND, "run": run_record(self._record), "progress": asdict(progress)}
+        write_tensors(self._options.folder / TRAINER_FILE, tensors, record)
+        self._saved_step = progress.step
+        if self._validation is None or progress.best_step is not None:
+            save_result(self._options.folder, self._record, tensors, progress)
 
     def _require_finite(self, number: float) -> None:
         if not math.isfinite(number):
             raise RequestError(
-                f"the loss is not finite any more at step {self._progress.step}; lower "
+                f"the loss is not finite any more at step {self.progress.step}; lower "
                 f"--learning_rate (the state of step {self._saved_step} is kept)"
             )
 
-    def _say_progress(self, bar: tqdm, loss: float) -> None:
-        step, total = self._progress.step, self._settings.steps
-        between = max(total // _LINES, 1)
-        if not (bar.disable and self._pace.progress) or step % between >= self._pace.log_every:
-            return
-        seconds = self._seconds()
-        left = seconds / step * (total - step)
-        logger.info(
-            "step %d of %d, loss %.4g, %.0f s, %.0f s left", step, total, loss, seconds, left
-        )
 
-    def _seconds(self) -> float:
-        return self._seconds_before + time.perf_counter() - self._start
+def torch_seed(seed: int, stream: str, *numbers: int) -> int:
+    """Return a seed of a named stream for PyTorch."""
+    return int(stream_generator(seed, stream, *numbers).integers(2**63))
 
 
-def run_record(record: CheckpointRecord) -> dict[str, object]:
-    """What must be the same when a run is carried on."""
-    run = asdict(record)
-    for name in ("step", "validation", "versions"):
-        del run[name]
-    return run
+def run_record(record: CheckpointRecord) -> dict[str, Any]:
+    """Return what must be the same when a run is carried on."""
+    left_out = ("step", "validation", "versions")
+    return {name: value for name, value in asdict(record).items() if name not in left_out}
+
+
+def read_trainer_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], TrainerProgress]:
+    """Read a trainer's tensors, `run_record` and progress.
+
+    Raises:
+        RequestError: the file is damaged or of another schema.
+    """
+    tensors, record, _ = read_tensors(path)
+    require_kind(path, record, KIND)
+    return tensors, record["run"], TrainerProgress(**record["progress"])
+
+
+def result_step(progress: TrainerProgress) -> int:
+    """Return the step whose weights are the result: the best on a held-out fold, else the last."""
+    return progress.step if progress.best_step is None else progress.best_step
+
+
+def save_result(
+    folder: Path, record: CheckpointRecord, tensors: Mapping[str, Tensor], progress: TrainerProgress
+) -> None:
+    """Write the network of `result_step` from a trainer's tensors; the last one is averaged."""
+    state = _without("best/", tensors)
+    if progress.best_step is None:
+        state = _without("average/", tensors) or _without("weights/", tensors)
+    record = replace(record, step=result_step(progress), validation=progress.best)
+    save_predictor_checkpoint(folder, record, state)
+
+
+def _prefixed(prefix: str, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {f"{prefix}{name}": tensor for name, tensor in tensors.items()}
+
+
+def _without(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with ``prefix``, named without it."""
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}

@@ -1,13 +1,12 @@
-"""Decoded pictures of sequences, kept in memory as far as it goes.
+"""Training data: windows of sequences, sampled, read ahead and augmented.
 
-Legend: F frames of a sequence, S side of the pictures.
+Shapes: B batch, N frames, L = 468 landmarks, S side of the images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -20,23 +19,31 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History, PredictorModel
 from face_prediction.tracking.tracks import NUM_LANDMARKS
-from face_prediction.training.seeds import generator
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.seeds import stream_generator
+
+MIDLINE = (0, 1, 2, 4, 5, 6, *range(8, 20), 94, 151, 152, 164, 168, 175, 195, 197, 199, 200)
+"""Landmarks on the line that halves a face."""
+_FIRST_LEFT = 248  # from here on landmarks are on the subject's left, ordered as on the right
+
+GAIN, LIGHT = 0.2, 0.1
+"""Brightness is multiplied by 1 ± GAIN at most, and ± LIGHT at most is added (ours)."""
+MOVE = 0.08
+"""Largest shift of a face in crops: the room that `build-dataset` leaves around it (ours)."""
 
 
-class PictureStore:
-    """Reads pictures of one size; each frame is decoded when it is first needed.
+class SequenceImages:
+    """Images of sequences at one size; each frame is decoded when it is first needed.
 
-    What has been decoded stays in memory until ``memory`` is used up; after that, what is not
-    there is decoded every time.
+    Decoded frames stay in memory until it is used up; after that, others are decoded every time.
 
     Args:
         dataset: open for reading; used by one thread.
-        size: side of the pictures.
+        size: side of the images.
         memory: bytes.
 
     Raises:
-        RequestError: the dataset's pictures cannot be read at this size.
+        RequestError: the dataset's images cannot be read at this size.
     """
 
     def __init__(self, dataset: FaceDataset, size: int, memory: float) -> None:
@@ -51,52 +58,38 @@ class PictureStore:
         self._dataset = dataset
         self._size = size
         self._frames_left = int(memory // (3 * size * size))
-        self._kept: dict[int, NDArray[np.uint8]] = {}
-        self._is_there: dict[int, NDArray[np.bool_]] = {}
+        self._kept: dict[int, tuple[NDArray[np.uint8], NDArray[np.bool_]]] = {}
 
     def read(self, index: int, start: int, stop: int) -> NDArray[np.uint8]:
-        """Pictures (stop - start, S, S, 3) RGB of sequence ``index``.
+        """Return images (stop - start, S, S, 3) RGB of sequence ``index``.
 
         Raises:
             RequestError: they are damaged.
         """
-        if index not in self._kept and self._frames_left < self._length:
-            return self._decode(index, start, stop)
         if index not in self._kept:
+            if self._frames_left < self._length:
+                return self._dataset.pictures(index, slice(start, stop), self._reduce)
             shape = (self._length, self._size, self._size, 3)
-            self._kept[index] = np.empty(shape, dtype=np.uint8)
-            self._is_there[index] = np.zeros(self._length, dtype=bool)
+            self._kept[index] = np.empty(shape, np.uint8), np.zeros(self._length, dtype=bool)
             self._frames_left -= self._length
-        kept, is_there = self._kept[index], self._is_there[index]
-        missing = np.flatnonzero(~is_there[start:stop])
+        images, is_decoded = self._kept[index]
+        missing = np.flatnonzero(~is_decoded[start:stop])
         if len(missing):
-            first, last = start + int(missing[0]), start + int(missing[-1]) + 1
-            kept[first:last] = self._decode(index, first, last)
-            is_there[first:last] = True
-        return kept[start:stop]
-
-    def read_all(
-        self, indices: Sequence[int], starts: Sequence[int], frames: int
-    ) -> NDArray[np.uint8]:
-        """Windows (B, frames, S, S, 3). Raises as `read` does."""
-        result = np.empty((len(indices), frames, self._size, self._size, 3), dtype=np.uint8)
-        for row, (index, start) in enumerate(zip(indices, starts, strict=True)):
-            result[row] = self.read(index, start, start + frames)
-        return result
-
-    def _decode(self, index: int, start: int, stop: int) -> NDArray[np.uint8]:
-        return self._dataset.pictures(index, slice(start, stop), self._reduce)
+            frames = slice(start + int(missing[0]), start + int(missing[-1]) + 1)
+            images[frames] = self._dataset.pictures(index, frames, self._reduce)
+            is_decoded[frames] = True
+        return images[start:stop]
 
 
-class Sampler:
-    """Batches of (sequence, first frame of its window), a pure function of (seed, step).
+class WindowSampler:
+    """Batches of (sequence, first frame of its window), a pure function of seed and step.
 
     Every epoch goes through all sequences in an order of its own; epochs follow one another
-    without a seam, so that every batch is full. Where a window (history and horizon) is shorter
+    without a gap, so that every batch is full. Where a window (history and horizon) is shorter
     than the sequences, it lies anywhere in them.
 
     Args:
-        sequences: how many there are.
+        sequences: number of them.
         length: frames of each.
         window: frames of a window.
         batch_size: of a batch.
@@ -113,129 +106,128 @@ class Sampler:
         self._order = lru_cache(maxsize=2)(self._draw_order)
 
     def batch(self, step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Sequences (B,) of 0...N - 1 and first frames (B,) of the batch of ``step``."""
+        """Return sequences (B,) of 0...N - 1 and first frames (B,) of the batch of ``step``."""
         places = step * self._batch_size + np.arange(self._batch_size)
         epochs, ranks = np.divmod(places, self._sequences)
         rows = np.array([self._order(int(e))[r] for e, r in zip(epochs, ranks, strict=True)])
-        starts = generator(self._seed, "window", step).integers(
-            self._last_start + 1, size=self._batch_size
-        )
-        return rows, starts
+        generator = stream_generator(self._seed, "window", step)
+        return rows, generator.integers(self._last_start + 1, size=self._batch_size)
 
     def _draw_order(self, epoch: int) -> NDArray[np.int64]:
-        return generator(self._seed, "order", epoch).permutation(self._sequences)
+        return stream_generator(self._seed, "order", epoch).permutation(self._sequences)
 
 
-class Batch(NamedTuple):
-    """What a network is shown, and what came after."""
+class WindowBatch(NamedTuple):
+    """Input and target of a network."""
 
     history: History
     future: Future
 
-    def to(self, device: torch.device) -> Batch:
-        """The same on ``device``."""
+    def to(self, device: torch.device) -> WindowBatch:
+        """Return the batch on ``device``."""
         if device.type == "cpu":
             return self
-        move = [
+        moved = [
             tensor.pin_memory().to(device, non_blocking=True)
             for part in self
-            for tensor in (part.landmarks, part.pictures)
+            for tensor in (part.landmarks, part.images)
         ]
-        return Batch(History(move[0], move[1]), Future(move[2], move[3]))
+        return WindowBatch(History(*moved[:2]), Future(*moved[2:]))
 
 
-class Windows:
-    """The sequences of some people, cut to what a network needs.
+class SequenceWindows:
+    """Sequences of some people, cut to the frames and images that a network needs.
 
     Args:
         dataset: open for reading; used by one thread.
-        indices: (N,) the sequences in it.
-        model: says which frames and pictures it needs.
-        memory: bytes for decoded pictures.
+        indices: (N,) sequences in it.
+        model: decides which frames and images are needed.
+        memory: bytes for decoded images.
 
     Attributes:
         sequences: their landmarks, whole.
+        frames: of a window.
 
     Raises:
-        RequestError: a file is damaged, or its pictures do not suit.
+        RequestError: a file is damaged, or its images do not fit.
     """
 
     def __init__(
-        self,
-        dataset: FaceDataset,
-        indices: NDArray[np.int64],
-        model: PredictorModel,
-        memory: float,
+        self, dataset: FaceDataset, indices: NDArray[np.int64], model: PredictorModel, memory: float
     ) -> None:
         self._indices = indices
-        self._history, self._horizon = model.history, model.horizon
+        self._history = model.history
         self._seen = model.needs.frames
-        self._made = model.horizon if model.makes_pictures else 0
+        self._images = self._seen + (model.horizon if model.makes_images else 0)
         self._size = model.needs.size
-        uses_pictures = self._seen or self._made
-        self._store = PictureStore(dataset, self._size, memory) if uses_pictures else None
+        self._store = SequenceImages(dataset, self._size, memory) if self._images else None
         points = [dataset.landmarks(int(index))[..., :2] for index in indices]
+        self.frames = model.history + model.horizon
         subjects = tuple(dataset.entry(int(index)).subject for index in indices)
         self.sequences = LandmarkSequences(np.stack(points), subjects)
 
     def __len__(self) -> int:
         return len(self._indices)
 
-    def batch(self, rows: NDArray[np.int64], starts: NDArray[np.int64]) -> Batch:
-        """Windows of the sequences ``rows`` (B,) that begin at the frames ``starts`` (B,).
+    def batch(self, rows: NDArray[np.int64], starts: NDArray[np.int64]) -> WindowBatch:
+        """Read the windows of the sequences ``rows`` (B,) from the frames ``starts`` (B,) on.
 
         Raises:
-            RequestError: a picture is damaged.
+            RequestError: an image is damaged.
         """
-        now = starts + self._history
-        frames = starts[:, None] + np.arange(self._history + self._horizon)
+        frames = starts[:, None] + np.arange(self.frames)
         landmarks = torch.from_numpy(self.sequences.landmarks[rows[:, None], frames])
-        # one read: the pictures that are seen and those that come after are neighbours
-        pictures = torch.from_numpy(self._pictures(rows, now - self._seen))
-        return Batch(
-            History(landmarks[:, : self._history], pictures[:, : self._seen]),
-            Future(landmarks[:, self._history :], pictures[:, self._seen :]),
+        images = np.empty((len(rows), self._images, self._size, self._size, 3), dtype=np.uint8)
+        if self._store is not None:
+            # one read: the images of history and future are neighbours
+            firsts = starts + self._history - self._seen
+            for place, (row, first) in enumerate(zip(rows, firsts.tolist(), strict=True)):
+                index = int(self._indices[row])
+                images[place] = self._store.read(index, first, first + self._images)
+        seen, coming = torch.from_numpy(images).tensor_split([self._seen], dim=1)
+        return WindowBatch(
+            History(landmarks[:, : self._history], seen),
+            Future(landmarks[:, self._history :], coming),
         )
 
-    def _pictures(self, rows: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.uint8]:
-        frames = self._seen + self._made
-        if self._store is None:
-            return np.empty((len(rows), 0, self._size, self._size, 3), dtype=np.uint8)
-        return self._store.read_all(self._indices[rows].tolist(), starts.tolist(), frames)
 
+def window_batches(
+    windows: SequenceWindows, batch_size: int, seed: int, start: int, stop: int
+) -> Generator[WindowBatch]:
+    """Yield the batches of the steps ``start`` to ``stop``, each read while the last is used.
 
-@contextmanager
-def batches(windows: Windows, sampler: Sampler, start: int, stop: int) -> Iterator[Iterator[Batch]]:
-    """The batches of the steps ``start`` to ``stop``; each is made while the last one is used."""
-
-    def made() -> Iterator[Batch]:
-        following = worker.submit(lambda: windows.batch(*sampler.batch(start)))
+    To be closed, where it is not used up.
+    """
+    length = windows.sequences.landmarks.shape[1]
+    sampler = WindowSampler(len(windows), length, windows.frames, batch_size, seed)
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as worker:
+        following = worker.submit(windows.batch, *sampler.batch(start))
         for step in range(start + 1, stop + 1):
             batch = following.result()
             if step < stop:
                 following = worker.submit(windows.batch, *sampler.batch(step))
             yield batch
 
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="pictures") as worker:
-        yield made()
+
+def augment(batch: WindowBatch, rng: np.random.Generator) -> WindowBatch:
+    """Mirror about half of the sequences; move each and change its light."""
+    rows, size = len(batch.history.landmarks), batch.history.images.shape[2]
+    is_mirrored = torch.from_numpy(rng.random(rows) < 0.5)
+    pixels = torch.from_numpy(np.rint(rng.uniform(-MOVE, MOVE, (rows, 2)) * size).astype(np.int64))
+    gain = torch.from_numpy(rng.uniform(1 - GAIN, 1 + GAIN, rows).astype(np.float32))
+    light = torch.from_numpy(rng.uniform(-LIGHT, LIGHT, rows).astype(np.float32))
+
+    def changed(part: History | Future) -> tuple[Tensor, Tensor]:
+        landmarks = mirrored_landmarks(part.landmarks, is_mirrored)
+        images = relit(mirrored_images(part.images, is_mirrored), gain, light)
+        step = (pixels / size).to(landmarks)[:, None, None]
+        return landmarks + step, moved_images(images, pixels)
+
+    return WindowBatch(History(*changed(batch.history)), Future(*changed(batch.future)))
 
 
-#: Landmarks on the line that halves a face.
-MIDLINE = (
-    *(0, 1, 2, 4, 5, 6, *range(8, 20)),
-    *(94, 151, 152, 164, 168, 175, 195, 197, 199, 200),
-)
-#: From here on landmarks are on the subject's left, in the order of those on the right.
-_FIRST_LEFT = 248
-
-#: Brightness is multiplied by up to 1 more or less this, and that much of it is added (ours).
-GAIN, LIGHT = 0.2, 0.1
-#: A face is moved by up to this, in crops: the room that `build-dataset` leaves around it (ours).
-MOVE = 0.08
-
-
-def mirror_indices() -> np.ndarray:
-    """(L,) int: the landmark that each becomes when a face is turned left to right.
+def mirror_indices() -> NDArray[np.int64]:
+    """Return the landmark (L,) that each becomes when a face is mirrored left to right.
 
     Measured on MediaPipe's canonical face, which is its own mirror image to the last digit.
     """
@@ -249,58 +241,38 @@ def mirror_indices() -> np.ndarray:
 _MIRROR = torch.from_numpy(mirror_indices())
 
 
-def augment(batch: Batch, rng: np.random.Generator) -> Batch:
-    """Turn about half of the sequences; move each and change its light."""
-    rows, size = len(batch.history.landmarks), batch.history.pictures.shape[2]
-    is_turned = torch.from_numpy(rng.random(rows) < 0.5)
-    pixels = torch.from_numpy(np.rint(rng.uniform(-MOVE, MOVE, (rows, 2)) * size).astype(np.int64))
-    gain = torch.from_numpy(rng.uniform(1 - GAIN, 1 + GAIN, rows).astype(np.float32))
-    light = torch.from_numpy(rng.uniform(-LIGHT, LIGHT, rows).astype(np.float32))
-
-    def landmarks(values: Tensor) -> Tensor:
-        step = (pixels / size).to(values)[:, None, None]
-        return mirrored_landmarks(values, is_turned) + step
-
-    def pictures(values: Tensor) -> Tensor:
-        return moved_pictures(relit(mirrored_pictures(values, is_turned), gain, light), pixels)
-
-    return Batch(
-        History(landmarks(batch.history.landmarks), pictures(batch.history.pictures)),
-        Future(landmarks(batch.future.landmarks), pictures(batch.future.pictures)),
-    )
+def mirrored_landmarks(landmarks: Tensor, is_mirrored: Tensor) -> Tensor:
+    """Mirror the rows of landmarks (B, N, L, 2) where ``is_mirrored`` (B,): u becomes 1 - u."""
+    mirrored = landmarks[:, :, _MIRROR.to(landmarks.device)]
+    mirrored = torch.stack([1 - mirrored[..., 0], mirrored[..., 1]], dim=-1)
+    return torch.where(_per_row(is_mirrored, landmarks), mirrored, landmarks)
 
 
-def mirrored_landmarks(landmarks: Tensor, is_turned: Tensor) -> Tensor:
-    """Landmarks (B, N, L, 2), the rows of ``is_turned`` (B,) in the mirror: u becomes 1 - u."""
-    turned = landmarks[:, :, _MIRROR.to(landmarks.device)]
-    turned = torch.stack([1 - turned[..., 0], turned[..., 1]], dim=-1)
-    return torch.where(is_turned.to(landmarks.device)[:, None, None, None], turned, landmarks)
+def mirrored_images(images: Tensor, is_mirrored: Tensor) -> Tensor:
+    """Mirror the rows of images (B, N, S, S, 3) where ``is_mirrored`` (B,)."""
+    return torch.where(_per_row(is_mirrored, images), images.flip(3), images)
 
 
-def mirrored_pictures(pictures: Tensor, is_turned: Tensor) -> Tensor:
-    """Pictures (B, N, S, S, 3), the rows of ``is_turned`` (B,) in the mirror."""
-    result = pictures.clone()
-    rows = is_turned.nonzero()[:, 0].to(pictures.device)
-    result[rows] = pictures[rows].flip(3)
-    return result
+def moved_images(images: Tensor, pixels: Tensor) -> Tensor:
+    """Move the rows of images (B, N, S, S, 3) by ``pixels`` (B, 2) to the right and down.
 
-
-def moved_pictures(pictures: Tensor, pixels: Tensor) -> Tensor:
-    """Pictures (B, N, S, S, 3), each row moved by ``pixels`` (B, 2) to the right and down.
-
-    Black comes in, as where a crop reaches beyond the video's picture.
+    Black comes in, as where a crop reaches beyond the video's image.
     """
-    size = pictures.shape[2]
-    result = torch.zeros_like(pictures)
+    size = images.shape[2]
+    result = torch.zeros_like(images)
     for row, (x, y) in enumerate(pixels.tolist()):
         to_y, to_x = (slice(max(d, 0), size + min(d, 0)) for d in (y, x))
         from_y, from_x = (slice(max(-d, 0), size + min(-d, 0)) for d in (y, x))
-        result[row, :, to_y, to_x] = pictures[row, :, from_y, from_x]
+        result[row, :, to_y, to_x] = images[row, :, from_y, from_x]
     return result
 
 
-def relit(pictures: Tensor, gain: Tensor, light: Tensor) -> Tensor:
-    """Pictures (B, N, S, S, 3) uint8 in other light: ``gain`` (B,) x + ``light`` (B,) of 255."""
-    at = (slice(None), None, None, None, None)
-    gain, light = gain.to(pictures.device)[at], light.to(pictures.device)[at]
-    return (pictures * gain).add_(255 * light).round_().clamp_(0, 255).to(torch.uint8)
+def relit(images: Tensor, gain: Tensor, light: Tensor) -> Tensor:
+    """Return images x ``gain`` (B,) + 255 x ``light`` (B,), for images (B, N, S, S, 3) uint8."""
+    lit = (images * _per_row(gain, images)).add_(255 * _per_row(light, images))
+    return lit.round_().clamp_(0, 255).to(torch.uint8)
+
+
+def _per_row(values: Tensor, target: Tensor) -> Tensor:
+    """Return ``values`` (B,) so that they broadcast over ``target`` (B, ...), on its device."""
+    return values.to(target.device).reshape(-1, *[1] * (target.dim() - 1))

@@ -148,13 +148,23 @@ def _to_line(values: Mapping[str, Any]) -> str:
     return json.dumps(rounded, allow_nan=False)
 
 
-def write_curves(path: Path, lines: Sequence[dict[str, Any]], title: str) -> bool:
+def write_curves(
+    path: Path,
+    lines: Sequence[dict[str, Any]],
+    title: str,
+    panels: Mapping[str, Sequence[str]] | None = None,
+) -> bool:
     """Draw the losses of ``metrics.jsonl`` over the steps, on a logarithmic scale.
 
     Args:
         path: of the PNG.
         lines: as `read_metrics` gives them.
+<<<<<<< HEAD
         title: of the figure.
+=======
+        title: above the panels.
+        panels: label of each panel, and the numbers drawn in it; by default every loss has one.
+>>>>>>> refs/heads/fb
 
     Returns:
         Whether it was drawn: matplotlib may not be installed, and there may be nothing to draw.
@@ -169,25 +179,29 @@ def write_curves(path: Path, lines: Sequence[dict[str, Any]], title: str) -> boo
     train, validation = by_kind["train"], by_kind["validation"]
     if not train:
         return False
-    other = ("kind", "step", "epoch", "learning_rate", "grad_norm", "seconds")
-    # A policy whose loss has one part calls it twice.
-    parts = [n for n in train[-1] if n not in other and not n.startswith("seconds_")]
-    if len(parts) == 2 and all(line[parts[0]] == line.get(parts[1]) for line in train):
-        parts.pop()
-    figure = Figure(figsize=(4.5 * len(parts), 4.0), layout="constrained")
+    if panels is None:
+        other = ("kind", "step", "epoch", "learning_rate", "grad_norm", "seconds")
+        # A policy whose loss has one part calls it twice.
+        parts = [n for n in train[-1] if n not in other and not n.startswith("seconds_")]
+        if len(parts) == 2 and all(line[parts[0]] == line.get(parts[1]) for line in train):
+            parts.pop()
+        panels = {name: (name,) for name in parts}
+    figure = Figure(figsize=(4.5 * len(panels), 4.0), layout="constrained")
     FigureCanvasAgg(figure)
-    for place, name in enumerate(parts):
-        axes = figure.add_subplot(1, len(parts), place + 1)
+    for place, (panel, names) in enumerate(panels.items()):
+        axes = figure.add_subplot(1, len(panels), place + 1)
         for kind, marker in (("train", ""), ("validation", "o")):
-            points = [(x["step"], x[name]) for x in by_kind[kind] if x.get(name, 0.0) > 0.0]
-            if points:
-                label = "training" if kind == "train" else "held out"
-                axes.plot(*zip(*points, strict=True), marker=marker, markersize=3, label=label)
+            for name in names:
+                points = [(x["step"], x[name]) for x in by_kind[kind] if x.get(name, 0.0) > 0.0]
+                if points:
+                    people = "training" if kind == "train" else "held out"
+                    label = people if len(names) == 1 else f"{people}: {name.replace('_', ' ')}"
+                    axes.plot(*zip(*points, strict=True), marker=marker, markersize=3, label=label)
         axes.set_yscale("log")
         axes.set_xlabel("step")
-        axes.set_ylabel(name)
+        axes.set_ylabel(panel)
         axes.grid(True, which="both", alpha=0.3)
-        if place == 0 and validation:
+        if axes.lines and validation and (place == 0 or len(names) > 1):
             axes.legend()
     figure.suptitle(title)
     with atomic_file(path) as temporary:

@@ -37,7 +37,7 @@ def toy(history: int = 8, pictures: int = 5, span: int = 1, landmarks: bool = Tr
             super().__init__()
             self.history, self.horizon, self.span = history, 5, span
             self.needs = PictureNeeds(pictures, 32)
-            self.makes_pictures = False
+            self.makes_images = False
             self.weight = torch.nn.Parameter(torch.tensor(1e-7, dtype=torch.float64))
             self.encoded: list[int] = []
 
@@ -49,12 +49,12 @@ def toy(history: int = 8, pictures: int = 5, span: int = 1, landmarks: bool = Tr
             old = new[:, : new.shape[1] - span + 1]
             return torch.stack([new[:, span - 1 :], new[:, span - 1 :] - old], dim=-1)
 
-        def decode(self, landmarks, features, last_picture, make_pictures=True):
+        def decode(self, landmarks, features, last_image, make_images=True):
             assert landmarks.shape[1:] == (history, 468, 2)
             assert features.shape[1] == pictures - span + 1
             order = torch.arange(1, features.shape[1] + 1, dtype=torch.float64)
             mixed = (features * order[None, :, None]).sum(dim=(1, 2))
-            mixed = mixed + last_picture.double().sum(dim=(1, 2, 3))
+            mixed = mixed + last_image.double().sum(dim=(1, 2, 3))
             ahead = landmarks[:, -1:] + (landmarks[:, -1:] - landmarks[:, :1])
             steps = torch.arange(1, 6, dtype=torch.float64)[None, :, None, None]
             moved = (ahead.double() + self.weight * mixed[:, None, None, None] * steps).float()

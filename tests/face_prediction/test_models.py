@@ -22,7 +22,7 @@ from face_prediction.models.settings import (
     PRESETS,
     CrossAttentionSettings,
     FusionSettings,
-    make_model,
+    make_predictor_model,
     preset_settings,
     settings_class,
 )
@@ -31,7 +31,7 @@ from robo_manip_baselines.runs.errors import RequestError
 APPROACHES = ("image_only", "simple_fusion", "cross_attention")
 TINY = {
     "size": 32,
-    "channels": (4, 6),
+    "channels": (8, 16),
     "width": 16,
     "heads": 2,
     "layers": 1,
@@ -43,19 +43,19 @@ TINY = {
 
 def tiny(name: str, **changes):
     torch.manual_seed(0)
-    return make_model(name, settings_class(name)().changed({**TINY, **changes})).eval()
+    return make_predictor_model(name, settings_class(name)().changed({**TINY, **changes})).eval()
 
 
 def history(rows: int = 2, seed: int = 0) -> History:
     g = torch.Generator().manual_seed(seed)
-    pictures = torch.randint(0, 256, (rows, 6, 32, 32, 3), generator=g, dtype=torch.uint8)
-    return History(torch.rand(rows, 6, 468, 2, generator=g), pictures)
+    images = torch.randint(0, 256, (rows, 6, 32, 32, 3), generator=g, dtype=torch.uint8)
+    return History(torch.rand(rows, 6, 468, 2, generator=g), images)
 
 
 def future(rows: int = 2, seed: int = 1) -> Future:
     g = torch.Generator().manual_seed(seed)
-    pictures = torch.randint(0, 256, (rows, 3, 32, 32, 3), generator=g, dtype=torch.uint8)
-    return Future(torch.rand(rows, 3, 468, 2, generator=g), pictures)
+    images = torch.randint(0, 256, (rows, 3, 32, 32, 3), generator=g, dtype=torch.uint8)
+    return Future(torch.rand(rows, 3, 468, 2, generator=g), images)
 
 
 def test_cross_attention_is_equations_1_to_3() -> None:
@@ -91,14 +91,14 @@ def test_what_comes_out(name: str) -> None:
     model = tiny(name)
     with torch.no_grad():
         output = model(history())
-    assert output.pictures.shape == (2, 3, 3, 32, 32)
-    assert float(output.pictures.min()) >= 0.0
-    assert float(output.pictures.max()) <= 1.0
+    assert output.images.shape == (2, 3, 3, 32, 32)
+    assert float(output.images.min()) >= 0.0
+    assert float(output.images.max()) <= 1.0
     if name == "image_only":
         assert output.landmarks is None
     else:
         assert output.landmarks.shape == (2, 3, 468, 2)
-    assert (model.history, model.horizon, model.span, model.makes_pictures) == (6, 3, 1, True)
+    assert (model.history, model.horizon, model.span, model.makes_images) == (6, 3, 1, True)
     assert (model.needs.frames, model.needs.size) == (6, 32)
 
 
@@ -109,7 +109,7 @@ def test_the_loss_is_equation_5(name: str) -> None:
         output, losses = model(history()), model.loss(history(), future())
     truth = future()
     image = np.mean(
-        (output.pictures.numpy() - truth.pictures.numpy().transpose(0, 1, 4, 2, 3) / 255.0) ** 2
+        (output.images.numpy() - truth.images.numpy().transpose(0, 1, 4, 2, 3) / 255.0) ** 2
     )
     expected = {"image": image}
     total = image
@@ -121,7 +121,7 @@ def test_the_loss_is_equation_5(name: str) -> None:
 
 
 def differs(a, b) -> bool:
-    pairs = [(a.pictures, b.pictures), (a.landmarks, b.landmarks)]
+    pairs = [(a.images, b.images), (a.landmarks, b.landmarks)]
     return any(x is not None and float((x - y).abs().max()) > 1e-6 for x, y in pairs)
 
 
@@ -133,12 +133,12 @@ def test_what_is_looked_at(name: str) -> None:
     with torch.no_grad():
         before = model(seen)
         for frame in (0, 5):
-            pictures = seen.pictures.clone()
-            pictures[:, frame] = 255 - pictures[:, frame]
-            assert differs(before, model(History(seen.landmarks, pictures)))
+            images = seen.images.clone()
+            images[:, frame] = 255 - images[:, frame]
+            assert differs(before, model(History(seen.landmarks, images)))
             landmarks = seen.landmarks.clone()
             landmarks[:, frame] += 0.3
-            other = model(History(landmarks, seen.pictures))
+            other = model(History(landmarks, seen.images))
             assert differs(before, other) == (name != "image_only")
 
 
@@ -149,10 +149,10 @@ def test_order_in_time_counts_and_rows_do_not_touch(name: str) -> None:
     with torch.no_grad():
         output = model(seen)
         order = [4, 2, 0, 1, 3, 5]  # the last one stays
-        turned = model(History(seen.landmarks[:, order], seen.pictures[:, order]))
-        alone = model(History(seen.landmarks[1:2], seen.pictures[1:2]))
+        turned = model(History(seen.landmarks[:, order], seen.images[:, order]))
+        alone = model(History(seen.landmarks[1:2], seen.images[1:2]))
     assert differs(output, turned)
-    torch.testing.assert_close(alone.pictures, output.pictures[1:2], atol=1e-6, rtol=0)
+    torch.testing.assert_close(alone.images, output.images[1:2], atol=1e-6, rtol=0)
 
 
 def test_cross_attention_can_tell_the_frames_of_a_face_at_rest() -> None:
@@ -168,12 +168,11 @@ def test_features_are_of_one_frame_each(name: str) -> None:
     model = tiny(name)
     seen = history()
     with torch.no_grad():
-        together = model.encode(seen.landmarks, seen.pictures)
+        together = model.encode(seen.landmarks, seen.images)
         singly = [
-            model.encode(seen.landmarks[:, t : t + 1], seen.pictures[:, t : t + 1])
-            for t in range(6)
+            model.encode(seen.landmarks[:, t : t + 1], seen.images[:, t : t + 1]) for t in range(6)
         ]
-        output = model.decode(seen.landmarks, together, seen.pictures[:, -1])
+        output = model.decode(seen.landmarks, together, seen.images[:, -1])
         whole = model(seen)
     torch.testing.assert_close(torch.cat(singly, dim=1), together, atol=1e-5, rtol=1e-5)
     assert not differs(output, whole)
@@ -214,7 +213,7 @@ def test_a_face_that_never_moves_gives_finite_features() -> None:
 
 def test_colours_and_places_reach_the_features() -> None:
     torch.manual_seed(0)
-    encoder = ImageEncoder(32, (4, 6), 16)
+    encoder = ImageEncoder(32, (8, 16), 16)
     red = torch.zeros(1, 1, 32, 32, 3, dtype=torch.uint8)
     red[..., 0] = 200
     blue = red.flip(-1)
@@ -246,16 +245,16 @@ def test_settings_survive_json(name: str, preset: str) -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"width": 97}, "width=97: a multiple of"),
+        ({"width": 97}, "width=97: not divisible; valid: a multiple of"),
         ({"width": 0}, "width=0"),
-        ({"size": 100}, "one of 32, 64, 128, 256"),
+        ({"size": 100}, "valid: 32, 64, 128, 256"),
         ({"channels": ()}, "channels"),
         ({"channels": (4,) * 8}, "channels"),
         ({"channels": [4.5]}, "a list of whole numbers"),
         ({"dropout": 1.0}, "dropout=1.0"),
-        ({"heads": True}, "heads=True: a int"),
+        ({"heads": True}, "heads=True: wrong type; valid: int"),
         ({"landmark_weight": -1}, "landmark_weight=-1"),
-        ({"depth": 3}, "setting 'depth'; there are size, "),
+        ({"depth": 3}, "setting 'depth': unknown; valid: size, "),
     ],
 )
 def test_settings_out_of_range_are_refused(values, words: str) -> None:

@@ -45,8 +45,8 @@ def dataset(tmp_path: Path) -> Path:
 @pytest.fixture
 def trained(tmp_path: Path, dataset: Path) -> Callable[..., Path]:
     """A folder as ``train`` leaves it, of a tiny network with random weights."""
-    from face_prediction.models.checkpoint import CheckpointRecord, save_checkpoint
-    from face_prediction.models.settings import make_model, settings_class
+    from face_prediction.models.checkpoint import CheckpointRecord, save_predictor_checkpoint
+    from face_prediction.models.settings import make_predictor_model, settings_class
 
     def save(fold: int, model: str = "cross_attention", name: str = "", **changes: Any) -> Path:
         sizes = {"size": 32, "channels": (4, 8), "width": 16, "heads": 2, "feedforward": 16}
@@ -70,7 +70,9 @@ def trained(tmp_path: Path, dataset: Path) -> Callable[..., Path]:
             }
         )
         folder = tmp_path / (name or f"{model}_{fold}")
-        save_checkpoint(folder, record, make_model(model, settings).state_dict())
+        save_predictor_checkpoint(
+            folder, record, make_predictor_model(model, settings).state_dict()
+        )
         return folder
 
     return save

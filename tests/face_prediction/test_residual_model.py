@@ -10,13 +10,13 @@ from torch import Tensor
 from face_prediction.forecast import LandmarkSequences
 from face_prediction.models.interface import Future, History
 from face_prediction.models.residual.model import ResidualModel, cut_out, flow, warp
-from face_prediction.models.residual.settings import ResidualSettings
+from face_prediction.models.settings import ResidualSettings, preset_settings
 from face_prediction.tracking.lifting import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
 S = 32
 SETTINGS = ResidualSettings(
-    size=S, pictures=3, region=8, channels=(4, 8), width=8, refiner=4, history=32, recent=16
+    size=S, pictures=3, region=8, channels=(8, 16), width=8, refiner=8, history=32, recent=16
 )
 pytestmark = pytest.mark.long
 
@@ -100,15 +100,15 @@ def test_forward_is_decode_of_frame_by_frame_features(model: ResidualModel) -> N
     model = trained(model)
     seen = history()
     marks = seen.landmarks[:, -3:]
-    kept = [model.encode(marks[:, i : i + 2], seen.pictures[:, i : i + 2]) for i in range(2)]
-    live = model.decode(seen.landmarks, torch.cat(kept, dim=1), seen.pictures[:, -1])
+    kept = [model.encode(marks[:, i : i + 2], seen.images[:, i : i + 2]) for i in range(2)]
+    live = model.decode(seen.landmarks, torch.cat(kept, dim=1), seen.images[:, -1])
     torch.testing.assert_close(live.landmarks, model(seen).landmarks, rtol=0, atol=1e-6)
 
 
 def test_a_face_moved_as_a_whole_is_forecast_moved(model: ResidualModel) -> None:
     seen = history()
     there = model(seen).landmarks
-    moved = model(History(seen.landmarks + 0.05, seen.pictures)).landmarks
+    moved = model(History(seen.landmarks + 0.05, seen.images)).landmarks
     torch.testing.assert_close(moved - there, torch.full_like(there, 0.05), rtol=0, atol=2e-4)
 
 
@@ -139,7 +139,7 @@ def test_the_likelihood_is_a_student_t(model: ResidualModel) -> None:
     shown = pictures(1, 8)
     # 16 frames of history: a single origin
     small = ResidualModel(
-        ResidualSettings(**{**SETTINGS.to_json(), "history": 16, "channels": (4, 8)})
+        ResidualSettings(**{**SETTINGS.to_json(), "history": 16, "channels": (8, 16)})
     )
     small.load_state_dict(model.state_dict())
     small.eval()
@@ -210,5 +210,5 @@ def test_settings_refuse_what_cannot_be(values: dict[str, object], words: str) -
 
 
 def test_settings_survive_json() -> None:
-    settings = ResidualSettings.preset("cpu")
-    assert ResidualSettings.from_json(settings.to_json()) == settings
+    settings, _ = preset_settings("residual", "cpu")
+    assert type(settings).from_json(settings.to_json()) == settings

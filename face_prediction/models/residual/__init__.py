@@ -1,1 +1,1 @@
-"""Residual prediction: a prior that adapts to the face it watches, corrected by a network."""
+"""Residual prediction: an adaptive prior, corrected by a network."""

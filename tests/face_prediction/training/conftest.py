@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,13 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.commands.train import TrainOptions, run_train
+from face_prediction.commands.train import run_train
 from face_prediction.dataset.clip_file import EncodedPictures, encode_picture, write_clip
 from face_prediction.dataset.manifest import ClipEntry, Manifest, sequence_facts, write_manifest
 from face_prediction.dataset.sequences import clip_frames, find_sequences
 from face_prediction.dataset.settings import SequenceSettings
 from face_prediction.tracking.lifting import LIPS
 from face_prediction.training import setup as job
+from face_prediction.training import trainer as trainer_module
+from face_prediction.training.options import FaceTrainOptions
+from face_prediction.training.windows import WindowBatch
 
 SEQUENCES = SequenceSettings(history=8, future=2, stride=4, crop_size=64)
 PEOPLE = {"ann": 0, "bob": 0, "cat": 1, "dan": 2, "eve": 2}
@@ -84,8 +88,8 @@ def make_faces(make_track) -> Callable[[Path], Path]:
     return lambda folder: make_dataset(folder, make_track)
 
 
-def twelve_steps(dataset: Path, out: Path) -> TrainOptions:
-    return TrainOptions(
+def twelve_steps(dataset: Path, out: Path) -> FaceTrainOptions:
+    return FaceTrainOptions(
         model="cross_attention", dataset=dataset, out=out, settings=SETTINGS,
         steps=12, batch_size=3, validate_every=4, warmup_steps=2, ema_decay=0.5, augment=True,
         log_every=3, checkpoint_every=5, progress=False, device="cpu",
@@ -93,7 +97,7 @@ def twelve_steps(dataset: Path, out: Path) -> TrainOptions:
 
 
 @pytest.fixture
-def options(dataset: Path, tmp_path: Path) -> TrainOptions:
+def options(dataset: Path, tmp_path: Path) -> FaceTrainOptions:
     return twelve_steps(dataset, tmp_path / "run")
 
 
@@ -106,9 +110,9 @@ def whole(dataset: Path, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def finished(dataset: Path, tmp_path_factory) -> TrainOptions:
+def finished(dataset: Path, tmp_path_factory) -> FaceTrainOptions:
     """The options of a short run that is done; its folder is not to be changed."""
-    options = TrainOptions(
+    options = FaceTrainOptions(
         model="cross_attention", dataset=dataset, out=tmp_path_factory.mktemp("runs") / "run",
         settings=SETTINGS, steps=1, batch_size=2, progress=False, device="cpu",
     )  # fmt: skip
@@ -117,7 +121,7 @@ def finished(dataset: Path, tmp_path_factory) -> TrainOptions:
 
 
 @pytest.fixture
-def trained(finished: TrainOptions) -> Path:
+def trained(finished: FaceTrainOptions) -> Path:
     """The folder of a network; not to be changed."""
     return finished.folder
 
@@ -125,4 +129,21 @@ def trained(finished: TrainOptions) -> Path:
 @pytest.fixture
 def no_curves(monkeypatch) -> None:
     """Drawing takes longer than these trainings."""
-    monkeypatch.setattr(job, "draw_curves", lambda folder: None)
+    monkeypatch.setattr(job, "write_curves", lambda *arguments: None)
+
+
+@pytest.fixture
+def before_step(monkeypatch) -> Callable[[Callable[[int, WindowBatch], WindowBatch | None]], None]:
+    """Sets a function that is given every step and its batch, and may raise or return another."""
+    original = trainer_module.window_batches
+
+    def install(function: Callable[[int, WindowBatch], WindowBatch | None]) -> None:
+        def hooked(windows, batch_size: int, seed: int, start: int, stop: int):
+            batches = original(windows, batch_size, seed, start, stop)
+            with contextlib.closing(batches):
+                for step, batch in enumerate(batches, start):
+                    yield function(step, batch) or batch
+
+        monkeypatch.setattr(trainer_module, "window_batches", hooked)
+
+    return install

@@ -1,4 +1,4 @@
-"""Mirrored, moved and relit sequences: all frames alike, landmarks with their pictures."""
+"""Mirrored, moved and relit sequences: all frames alike, landmarks with their images."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from face_prediction.tracking.geometry import read_canonical_face, rigid_face
 from face_prediction.training import windows as augmentation
 from face_prediction.training.windows import (
     MIDLINE,
-    Batch,
+    WindowBatch,
     augment,
     mirror_indices,
+    mirrored_images,
     mirrored_landmarks,
-    mirrored_pictures,
-    moved_pictures,
+    moved_images,
     relit,
 )
 
@@ -49,23 +49,23 @@ class TestMirror:
 
 
 class TestAugmentation:
-    def batch(self, rows: int = 64) -> Batch:
+    def batch(self, rows: int = 64) -> WindowBatch:
         """Faces whose nose tip (landmark 1) and a red pixel are at the same place."""
         rng = np.random.default_rng(0)
         landmarks = torch.from_numpy(rng.uniform(0, 1, (rows, 5, 468, 2)).astype(np.float32))
-        pictures = torch.full((rows, 5, 16, 16, 3), 100, dtype=torch.uint8)
+        images = torch.full((rows, 5, 16, 16, 3), 100, dtype=torch.uint8)
         for row in range(rows):
             for frame in range(5):
                 x, y = rng.integers(2, 14, size=2)  # so that it is never moved out
-                pictures[row, frame, y, x, 0] = 255
+                images[row, frame, y, x, 0] = 255
                 landmarks[row, frame, 1] = torch.tensor([(x + 0.5) / 16, (y + 0.5) / 16])
-        return Batch(
-            History(landmarks[:, :3], pictures[:, :3]), Future(landmarks[:, 3:], pictures[:, 3:])
+        return WindowBatch(
+            History(landmarks[:, :3], images[:, :3]), Future(landmarks[:, 3:], images[:, 3:])
         )
 
     def test_landmarks_and_pictures_are_turned_together(self) -> None:
         for part in augment(self.batch(), np.random.default_rng(0)):
-            red = part.pictures[..., 0].float() - part.pictures[..., 1].float()
+            red = part.images[..., 0].float() - part.images[..., 1].float()
             place = red.flatten(2).argmax(dim=2)
             seen = torch.stack([place % 16 + 0.5, place // 16 + 0.5], dim=-1) / 16
             torch.testing.assert_close(part.landmarks[:, :, 1], seen)
@@ -102,11 +102,9 @@ class TestAugmentation:
         assert set(steps[:, 0].round().int().tolist()) == {-1, 0, 1}
 
     def test_what_moves_in_is_black(self) -> None:
-        pictures = (
-            torch.arange(1, 17, dtype=torch.uint8).reshape(1, 1, 4, 4, 1).expand(3, 1, 4, 4, 3)
-        )
+        images = torch.arange(1, 17, dtype=torch.uint8).reshape(1, 1, 4, 4, 1).expand(3, 1, 4, 4, 3)
         moves = torch.tensor([[1, 0], [0, -2], [-1, 1]])
-        right, up, both = moved_pictures(pictures, moves)[:, 0, :, :, 0].tolist()
+        right, up, both = moved_images(images, moves)[:, 0, :, :, 0].tolist()
         assert right == [[0, 1, 2, 3], [0, 5, 6, 7], [0, 9, 10, 11], [0, 13, 14, 15]]
         assert up == [[9, 10, 11, 12], [13, 14, 15, 16], [0] * 4, [0] * 4]
         assert both == [[0] * 4, [2, 3, 4, 0], [6, 7, 8, 0], [10, 11, 12, 0]]
@@ -123,19 +121,17 @@ class TestAugmentation:
         both = torch.ones(4, dtype=torch.bool)
         twice = mirrored_landmarks(mirrored_landmarks(part.landmarks, both), both)
         torch.testing.assert_close(twice, part.landmarks)
-        assert torch.equal(
-            mirrored_pictures(mirrored_pictures(part.pictures, both), both), part.pictures
-        )
+        assert torch.equal(mirrored_images(mirrored_images(part.images, both), both), part.images)
 
     def test_light_is_multiplied_shifted_and_clipped(self) -> None:
-        pictures = torch.tensor([0, 100, 250], dtype=torch.uint8).expand(2, 1, 1, 1, 3)
-        lit = relit(pictures, torch.tensor([1.2, 1.0]), torch.tensor([0.1, -0.02]))
+        images = torch.tensor([0, 100, 250], dtype=torch.uint8).expand(2, 1, 1, 1, 3)
+        lit = relit(images, torch.tensor([1.2, 1.0]), torch.tensor([0.1, -0.02]))
         assert lit[0].flatten().tolist() == [26, 146, 255]  # 25.5, 145.5, 325.5
         assert lit[1].flatten().tolist() == [0, 95, 245]  # -5.1, 94.9, 244.9
 
     def test_all_frames_of_a_sequence_get_the_same_light(self) -> None:
         after = augment(self.batch(), np.random.default_rng(2))
-        green = torch.cat([part.pictures[..., 1] for part in after], dim=1)
+        green = torch.cat([part.images[..., 1] for part in after], dim=1)
         frames = green[:, :, 2:14, 2:14]  # all alike, but for what came in at the edges
         assert torch.equal(frames.amax(dim=(1, 2, 3)), frames.amin(dim=(1, 2, 3)))
         assert len(frames.amax(dim=(1, 2, 3)).unique()) > 20

@@ -58,7 +58,7 @@ class TestLearnedPredictor:
             history = History(
                 torch.tensor(landmarks[:, 2:], dtype=torch.float32), torch.tensor(pictures)
             )
-            out = predictor.model(history).pictures.numpy()
+            out = predictor.model(history).images.numpy()
         expected = out.transpose(0, 1, 3, 4, 2) * 255
         assert got is not None
         np.testing.assert_allclose(got, expected, atol=0.51)
@@ -120,8 +120,8 @@ class TestDamage:
         [
             ("schema", "other", "schema 'other' version 1, expected 'face_predictor' 1"),
             ("version", 2, "version 2, expected 'face_predictor' 1"),
-            ("model", "gpt", "model 'gpt'; there are"),
-            ("model_sha256", "0", "not of the same moment"),
+            ("model", "gpt", "model 'gpt': unknown; valid: image_only"),
+            ("model_sha256", "0", "are of different steps"),
         ],
     )
     def test_the_record(self, folder: Path, key: str, value, words: str) -> None:

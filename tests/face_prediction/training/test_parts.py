@@ -8,6 +8,7 @@ import os
 import signal
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,46 +17,48 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from face_prediction.dataset.manifest import fold_split
-from face_prediction.models.settings import TrainSettings
-from face_prediction.training.metrics import MetricsLog, RunningMean, draw_curves, read_metrics
-from face_prediction.training.options import choose_people
-from face_prediction.training.seeds import generator, torch_seed
-from face_prediction.training.windows import PictureStore, Sampler
+from face_prediction.models.settings import PredictorTrainSettings
+from face_prediction.training.options import FaceTrainOptions
+from face_prediction.training.setup import CURVES, choose_people
+from face_prediction.training.trainer import StepMeans, torch_seed
+from face_prediction.training.windows import SequenceImages, WindowSampler
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.interrupt import StopRequest
+from robo_manip_baselines.runs.metrics import write_curves
+from robo_manip_baselines.runs.seeds import stream_generator
 
 
 class TestSampler:
     @given(st.integers(1, 12), st.integers(1, 9), st.integers(0, 2**32))
     def test_every_epoch_goes_through_all_once(self, count: int, batch: int, seed: int) -> None:
-        sampler = Sampler(count, 10, 10, batch, seed)
+        sampler = WindowSampler(count, 10, 10, batch, seed)
         rows = np.concatenate([sampler.batch(step)[0] for step in range(3 * count)])
         for epoch in range(3):
             assert sorted(rows[epoch * count : (epoch + 1) * count]) == list(range(count))
 
     def test_a_batch_is_a_function_of_seed_and_step(self) -> None:
-        one, other = Sampler(50, 75, 25, 4, 7), Sampler(50, 75, 25, 4, 7)
+        one, other = WindowSampler(50, 75, 25, 4, 7), WindowSampler(50, 75, 25, 4, 7)
         for step in (90, 3, 91, 0, 12):  # in another order, from another object
             for a, b in zip(one.batch(step), other.batch(step), strict=True):
                 np.testing.assert_array_equal(a, b)
-        different = Sampler(50, 75, 25, 4, 8)
+        different = WindowSampler(50, 75, 25, 4, 8)
         assert any(not np.array_equal(one.batch(s)[0], different.batch(s)[0]) for s in range(3))
 
     def test_epochs_have_orders_of_their_own(self) -> None:
-        sampler = Sampler(20, 10, 10, 20, 0)
+        sampler = WindowSampler(20, 10, 10, 20, 0)
         assert not np.array_equal(sampler.batch(0)[0], sampler.batch(1)[0])
 
     def test_windows_lie_anywhere_in_the_sequence(self) -> None:
-        sampler = Sampler(5, 75, 25, 50, 0)
+        sampler = WindowSampler(5, 75, 25, 50, 0)
         starts = np.concatenate([sampler.batch(step)[1] for step in range(40)])
         assert set(starts) == set(range(51))
-        whole = Sampler(5, 75, 75, 50, 0)
+        whole = WindowSampler(5, 75, 75, 50, 0)
         assert set(whole.batch(3)[1]) == {0}
 
 
 class TestSettings:
     def test_cosine_goes_from_the_rate_to_a_hundredth_after_warming_up(self) -> None:
-        settings = TrainSettings(
+        settings = PredictorTrainSettings(
             steps=110, batch_size=1, learning_rate=1.0, schedule="cosine", warmup_steps=10
         )
         rates = [settings.learning_rate_at(step) for step in range(111)]
@@ -66,7 +69,7 @@ class TestSettings:
         assert np.all(np.diff(rates[10:]) < 0)
 
     def test_constant_is_constant(self) -> None:
-        settings = TrainSettings(steps=9, batch_size=1, learning_rate=1e-4)
+        settings = PredictorTrainSettings(steps=9, batch_size=1, learning_rate=1e-4)
         assert {settings.learning_rate_at(step) for step in range(9)} == {1e-4}
 
     @pytest.mark.parametrize(
@@ -84,19 +87,13 @@ class TestSettings:
     )
     def test_values_out_of_range_name_the_option(self, name: str, value) -> None:
         with pytest.raises(RequestError, match=f"--{name} {value}"):
-            TrainSettings(**{"steps": 1, "batch_size": 1, name: value})
-
-    def test_json_and_back(self) -> None:
-        settings = TrainSettings(steps=3, batch_size=2, augment=True)
-        assert TrainSettings.from_json(json.loads(json.dumps(settings.to_json()))) == settings
-        with pytest.raises(RequestError, match="need the keys"):
-            TrainSettings.from_json({"steps": 3})
+            PredictorTrainSettings(**{"steps": 1, "batch_size": 1, name: value})
 
 
 def test_seeds_differ_by_name_and_place() -> None:
     seeds = {torch_seed(0, name, place) for name in ("a", "b") for place in range(5)}
     assert len(seeds | {torch_seed(1, "a", 0)}) == 11
-    assert generator(3, "x", 4).random() == generator(3, "x", 4).random()
+    assert torch_seed(3, "x", 4) == stream_generator(3, "x", 4).integers(2**63)
 
 
 class FakeDataset:
@@ -118,7 +115,7 @@ class FakeDataset:
 class TestPictures:
     def test_only_what_is_needed_is_decoded_and_only_once(self) -> None:
         dataset = FakeDataset()
-        store = PictureStore(dataset, 32, 1e9)  # pyright: ignore[reportArgumentType]
+        store = SequenceImages(dataset, 32, 1e9)  # pyright: ignore[reportArgumentType]
         for start, stop in ((3, 6), (4, 6), (2, 5), (0, 10), (0, 10)):
             got = store.read(2, start, stop)
             assert got.shape == (stop - start, 32, 32, 3)
@@ -127,7 +124,7 @@ class TestPictures:
 
     def test_beyond_the_memory_it_is_decoded_every_time(self) -> None:
         dataset = FakeDataset()
-        store = PictureStore(dataset, 32, 2.5 * 10 * 32 * 32 * 3)  # pyright: ignore[reportArgumentType]
+        store = SequenceImages(dataset, 32, 2.5 * 10 * 32 * 32 * 3)  # pyright: ignore[reportArgumentType]
         for _ in range(2):
             for index in range(4):
                 assert store.read(index, 0, 10)[9, 0, 0, 0] == 20 * index + 9
@@ -136,7 +133,7 @@ class TestPictures:
     @pytest.mark.parametrize("size", [128, 4, 48])
     def test_a_size_that_jpeg_does_not_give_is_refused(self, size: int) -> None:
         with pytest.raises(RequestError, match=f"64 pixels, but this network needs {size}"):
-            PictureStore(FakeDataset(), size, 1e9)  # pyright: ignore[reportArgumentType]
+            SequenceImages(FakeDataset(), size, 1e9)  # pyright: ignore[reportArgumentType]
 
 
 class FakePeople:
@@ -160,8 +157,8 @@ class FakePeople:
 
 class TestPeople:
     def choose(self, folds: int = 4, **options):
-        given = {"test_fold": 1, "hold_out": "next", "subjects": None, "seed": 0, **options}
-        return choose_people(FakePeople(folds), **given)  # pyright: ignore[reportArgumentType]
+        given = FaceTrainOptions(model="image_only", **{"test_fold": 1, **options})
+        return choose_people(FakePeople(folds), given)  # pyright: ignore[reportArgumentType]
 
     def test_the_next_fold_validates(self) -> None:
         people = self.choose()
@@ -211,37 +208,26 @@ class TestPeople:
 
 class TestMetrics:
     def test_means(self) -> None:
-        mean = RunningMean()
+        mean = StepMeans()
         for value in (1.0, 2.0, 6.0):
             mean.add({"a": torch.tensor(value), "b": torch.tensor(-value)})
-        carried_on = RunningMean(mean.names, json.loads(json.dumps(mean.rows())))
+        carried_on = StepMeans(mean.names, json.loads(json.dumps(mean.rows())))
         for one in (mean, carried_on):
             one.add({"a": torch.tensor(7.0), "b": torch.tensor(1.0)})
             assert one.take() == {"a": 4.0, "b": -2.0}
             one.add({"a": torch.tensor(5.0), "b": torch.tensor(0.0)})
             assert one.take() == {"a": 5.0, "b": 0.0}
 
-    def test_lines_after_the_step_are_written_again(self, tmp_path: Path) -> None:
-        log = MetricsLog(tmp_path, 0)
-        for step in (10, 20, 30):
-            log.write("train", step, {"loss": 1 / 3, "nothing": float("nan")})
-        path = tmp_path / "metrics.jsonl"
-        path.write_text(path.read_text() + '{"kind": "trai')  # killed while writing
-        MetricsLog(tmp_path, 20).write("train", 30, {"loss": 9.0})
-        assert read_metrics(path) == [
-            {"kind": "train", "step": 10, "loss": 0.3333333},
-            {"kind": "train", "step": 20, "loss": 0.3333333},
-            {"kind": "train", "step": 30, "loss": 9.0},
-        ]
-
-    def test_curves_are_drawn_even_of_nothing(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("is_held_out", [True, False])
+    def test_curves_are_drawn_of_what_there_is(self, tmp_path: Path, is_held_out: bool) -> None:
         pytest.importorskip("matplotlib", reason="matplotlib is not installed")
-        log = MetricsLog(tmp_path, 0)
-        draw_curves(tmp_path)
-        log.write("train", 10, {"loss": 0.5})
-        log.write("validation", 10, {"loss": 0.5, "mouth_error": 0.1})
-        draw_curves(tmp_path)
-        assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+        path = tmp_path / "curves.png"
+        assert not write_curves(path, [], "run", CURVES)
+        lines: list[dict[str, Any]] = [{"kind": "train", "step": 10, "loss": -0.5}]
+        if is_held_out:
+            lines.append({"kind": "validation", "step": 10, "loss": -0.5, "mouth_error": 0.1})
+        assert write_curves(path, lines, "run", CURVES)
+        assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_first_signal_is_noted_and_a_second_ends() -> None:

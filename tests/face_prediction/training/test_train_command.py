@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,16 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from face_prediction.commands.train import TrainOptions, run_train
+from face_prediction.commands.train import run_train
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation import mouth_distances, mouth_residuals
-from face_prediction.models.checkpoint import read_checkpoint, read_tensors
+from face_prediction.models.checkpoint import read_predictor_checkpoint, read_tensors
 from face_prediction.models.learned import LearnedPredictor
 from face_prediction.tracking.lifting import LIPS
-from face_prediction.training.metrics import read_metrics
-from face_prediction.training.setup import locked
-from face_prediction.training.step import TrainStep
+from face_prediction.training.options import FaceTrainOptions
+from face_prediction.training.windows import WindowBatch
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import locked
+from robo_manip_baselines.runs.metrics import read_metrics
 
 pytestmark = pytest.mark.long
 NETWORK = ("model.safetensors", "config.json")
@@ -36,7 +38,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def changed(options: TrainOptions, change: dict) -> TrainOptions:
+def changed(options: FaceTrainOptions, change: dict) -> FaceTrainOptions:
     """Other options; ``settings`` are added to those there are."""
     more = {"settings": (*options.settings, *change["settings"])} if "settings" in change else {}
     return replace(options, **{**change, **more})
@@ -52,7 +54,7 @@ def test_the_dataset_shows_what_it_says(dataset: Path) -> None:
 
 
 @pytest.mark.parametrize("model", ["image_only", "simple_fusion", "cross_attention"])
-def test_what_training_leaves(options: TrainOptions, dataset: Path, model) -> None:
+def test_what_training_leaves(options: FaceTrainOptions, dataset: Path, model) -> None:
     options = replace(options, model=model)
     assert run_train(options) == 0
     names = {path.name for path in options.folder.iterdir()}
@@ -60,7 +62,7 @@ def test_what_training_leaves(options: TrainOptions, dataset: Path, model) -> No
         "model.safetensors", "config.json", "trainer.safetensors", "metrics.jsonl", "curves.png",
         ".lock",
     }  # fmt: skip
-    record, _ = read_checkpoint(options.folder)
+    record, _ = read_predictor_checkpoint(options.folder)
     assert (record.model, record.preset, record.seed) == (model, "cpu", 0)
     assert record.settings["width"] == 16
     assert record.training["steps"] == 12
@@ -123,6 +125,19 @@ def test_a_finished_run_whose_network_is_damaged_writes_it_again(options, held: 
         assert {name: (options.folder / name).read_bytes() for name in NETWORK} == before
 
 
+def test_help_does_not_load_torch(repository: Path) -> None:
+    script = (
+        "import sys\nfrom face_prediction.commands.cli import main\n"
+        "try: main(['train', '--help'])\nexcept SystemExit: pass\n"
+        "sys.exit('torch' in sys.modules)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script], cwd=repository, capture_output=True, text=True, check=True
+    )
+    assert "Example: face-prediction train cross_attention" in result.stdout
+    assert "--validation_sequences" in result.stdout
+
+
 def test_without_torch_it_says_what_to_install(options, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "face_prediction.training.setup")
@@ -134,7 +149,7 @@ def test_without_torch_it_says_what_to_install(options, monkeypatch) -> None:
 def test_holding_nobody_out_keeps_the_last_weights(options) -> None:
     options = replace(options, hold_out="none", ema_decay=0.0)
     assert run_train(options) == 0
-    record, state = read_checkpoint(options.folder)
+    record, state = read_predictor_checkpoint(options.folder)
     assert record.step == 12
     assert record.folds == {"train": [1, 2], "validation": [], "test": [0]}
     assert record.train_subjects == ["cat", "dan", "eve"]
@@ -145,7 +160,7 @@ def test_holding_nobody_out_keeps_the_last_weights(options) -> None:
 
 
 @quick
-def test_seeds_and_data_make_the_weights(finished: TrainOptions, tmp_path: Path) -> None:
+def test_seeds_and_data_make_the_weights(finished: FaceTrainOptions, tmp_path: Path) -> None:
     first = tensors(finished.folder)
     changes = {"again": {}, "seed": {"seed": 1}, "people": {"subjects": 1}}
     for name, change in changes.items():
@@ -190,9 +205,9 @@ def test_a_folder_of_another_run_is_refused(finished, change, words: str) -> Non
         ({"settings": ("history=9",)}, "sequences of 8 . 2 frames"),
         ({"settings": ("horizon=3",)}, "needs 6 . 3"),
         ({"settings": ("size=128",)}, "64 pixels, but this network needs 128"),
-        ({"settings": ("width",)}, "--settings width: NAME=VALUE"),
+        ({"settings": ("width",)}, "--settings width: no value; valid: NAME=VALUE"),
         ({"steps": 0}, "--steps 0"),
-        ({"seed": -1}, "--seed -1: 0 or more"),
+        ({"seed": -1}, "--seed -1: too small; valid: 0 or more"),
         ({"memory_gb": float("nan")}, "--memory_gb nan"),
         ({"checkpoint_every": 0}, "--checkpoint_every 0"),
         ({"device": "gpu"}, "--device gpu"),
@@ -218,7 +233,7 @@ def test_a_damaged_picture_is_refused_by_name(options, tmp_path, make_faces) -> 
 
 @quick
 def test_a_folder_that_is_in_use_is_refused(options) -> None:
-    with locked(options.folder), pytest.raises(RequestError, match="another process trains here"):
+    with locked(options.folder), pytest.raises(RequestError, match="another process"):
         run_train(options)
     assert run_train(replace(options, steps=1)) == 0
 
@@ -232,15 +247,16 @@ def test_a_network_without_its_trainer_is_not_overwritten(finished, options) -> 
 
 
 @quick
-def test_weights_that_are_not_finite_are_not_saved(options, monkeypatch) -> None:
-    step = TrainStep.__call__
+@pytest.mark.parametrize("validate_every", [4, 12])
+def test_weights_that_are_not_finite_are_not_saved(options, before_step, validate_every) -> None:
+    """At step 8 the held-out error is the first to tell, else the mean loss at step 9."""
 
-    def exploding(self, batch, number):
-        numbers = step(self, batch, number)
-        return numbers if number < 6 else {k: v * float("nan") for k, v in numbers.items()}
+    def explode(step: int, batch: WindowBatch) -> WindowBatch | None:
+        future = replace(batch.future, landmarks=batch.future.landmarks * float("nan"))
+        return None if step < 6 else batch._replace(future=future)
 
-    monkeypatch.setattr(TrainStep, "__call__", exploding)
+    before_step(explode)
     with pytest.raises(RequestError, match=r"not finite.*the state of step 5 is kept"):
-        run_train(options)
+        run_train(replace(options, validate_every=validate_every))
     _, state, _ = read_tensors(options.folder / "trainer.safetensors")
     assert state["progress"]["step"] == 5
