@@ -159,12 +159,8 @@ def write_curves(
     Args:
         path: of the PNG.
         lines: as `read_metrics` gives them.
-<<<<<<< HEAD
-        title: of the figure.
-=======
         title: above the panels.
         panels: label of each panel, and the numbers drawn in it; by default every loss has one.
->>>>>>> refs/heads/fb
 
     Returns:
         Whether it was drawn: matplotlib may not be installed, and there may be nothing to draw.
