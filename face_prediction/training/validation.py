@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from face_prediction.evaluation import mouth_distances, mouth_residuals
 from face_prediction.models.interface import PredictorModel
+from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.step import TrainStep
 from face_prediction.training.windows import Batch, Windows
 
