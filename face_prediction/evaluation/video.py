@@ -262,11 +262,9 @@ class _Stage:
         plots: list[Any] = []
         for axis, label in enumerate(("mouth to the right, px", "mouth down, px")):
             plot = figure.add_subplot(grid[axis, 1])
-            values = [
-                timeline.mouth[:, axis],
-                *(f[..., axis].ravel() for _, f in timeline.forecasts),
-            ]
-            low, high = (float(f(np.concatenate(values))) for f in (np.nanmin, np.nanmax))
+            ahead = [forecasts[..., axis].ravel() for _, forecasts in timeline.forecasts]
+            values = np.concatenate([timeline.mouth[:, axis], *ahead])
+            low, high = float(np.nanmin(values)), float(np.nanmax(values))
             room = 0.08 * (high - low) + 0.5
             plot.set_ylim(low - room, high + room)
             if axis:
