@@ -146,10 +146,7 @@ def draw_forecast(
         truth: of one sequence, images included.
         forecast: of the same.
     """
-    images = [item.pictures for item in (truth, forecast)]
-    assert images[0] is not None
-    assert images[1] is not None
-    count = images[0].shape[1]
+    count = truth.landmarks.shape[1]
     # squares of known size: a layout that looks for the best takes seconds for twenty of them
     width, height = _LEFT + _STEP * count + _EDGE, _TOP + _STEP * 4 + _EDGE
     figure = new_matplotlib_figure(width, height, layout=None)
@@ -164,10 +161,11 @@ def draw_forecast(
         hspace=_GAP,
     )
     for number, line in enumerate(grid):
-        which, has_landmarks = divmod(number, 2)
-        label, item = ("truth", truth) if which == 0 else ("forecast", forecast)
+        label, item = ("truth", truth) if number < 2 else ("forecast", forecast)
+        has_landmarks = number % 2 == 1
+        assert item.pictures is not None
         for column, axes in enumerate(line):
-            axes.imshow(images[which][0, column], extent=(0, 1, 1, 0), interpolation="nearest")
+            axes.imshow(item.pictures[0, column], extent=(0, 1, 1, 0), interpolation="nearest")
             axes.set_xticks([])
             axes.set_yticks([])
             if has_landmarks:
@@ -237,7 +235,7 @@ def _draw_landmarks(axes: Any, landmarks: NDArray[np.floating]) -> None:
 
 
 def _lively_sequence(scores: EvaluationScores, kind: str) -> int:
-    """Place of a sequence that moves more than most of its kind: in the usual one little happens."""
+    """Place of a sequence that moves more than most of its kind: in most little happens."""
     places = scores.selection.of_kind(kind)
     last = mouth_distances(scores.row(PERSISTENCE).residuals[places])[:, -1]
     return int(places[np.argsort(last, kind="stable")[int(_LIVELIER_THAN * (len(last) - 1))]])

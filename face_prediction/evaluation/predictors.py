@@ -186,7 +186,7 @@ class EvaluatedPredictor:
         Raises:
             RequestError: as `predictor_for` does, or the landmarks have another shape.
         """
-        predictor = [self.predictor_for(row.fold, row.subject) for row in rows][0]
+        predictor, *_ = [self.predictor_for(row.fold, row.subject) for row in rows]
         expected = batch.future.shape
         forecast = predictor.predict(batch.history, batch.images(predictor.needs), expected[1])
         if forecast.landmarks.shape != expected:

@@ -31,9 +31,7 @@ FAR: Colour = (255, 60, 40)
 INSET = 0.34
 """Side of the magnified mouth as a share of the image's shorter side."""
 _ESCAPE = 27
-_FONT = (
-    0  # OpenCV's FONT_HERSHEY_SIMPLEX; what draws imports OpenCV, so that commands start without
-)
+_FONT = 0  # OpenCV's FONT_HERSHEY_SIMPLEX; OpenCV is imported only when something is drawn
 
 Show = Callable[[NDArray[np.uint8], float], bool]
 """Takes an image of a time in seconds; returns False once the user has seen enough."""
@@ -110,8 +108,9 @@ def draw_mouth(
     side = int(INSET * size.min())
     inset = Crop(left, top, window).cut(image, side)
     _draw_path(image, lips, path, max(1.5, 0.012 * face))
-    magnified = [(points - (left, top)) * (side / window) for points in (lips, path)]
-    _draw_path(inset, *magnified, max(2.0, 0.012 * side))
+    scale = side / window
+    corner = np.array([left, top])
+    _draw_path(inset, (lips - corner) * scale, (path - corner) * scale, max(2.0, 0.012 * side))
     cv2.rectangle(inset, (0, 0), (side - 1, side - 1), WHITE, 1)
     image[-side:, -side:] = inset
 

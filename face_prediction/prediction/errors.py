@@ -69,9 +69,12 @@ def mouth_errors(residuals: Floats) -> MouthErrors:
     known = has_forecast(residuals)
     size = np.abs(residuals)
     per_frame = [_mean_and_variance(size[known[:, h], h]) for h in range(residuals.shape[1])]
+    pooled_mean, pooled_variance = _mean_and_variance(size[known])
     return MouthErrors(
-        *map(np.stack, zip(*per_frame, strict=True)),
-        *_mean_and_variance(size[known]),
+        mean=np.stack([mean for mean, _ in per_frame]),
+        variance=np.stack([variance for _, variance in per_frame]),
+        pooled_mean=pooled_mean,
+        pooled_variance=pooled_variance,
         forecasts=known.sum(axis=0),
         missing=(~known).sum(axis=0),
     )
