@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 BATCH = 8
 """Sequences at once: of these, 70 images of 256 x 256 each are 110 MB."""
-TRUE_IMAGES = "detector on the true images"
+TRUE_IMAGES = "detector on the true pictures"
 """Row of the landmarks that the detector finds in true images: as well as images can do."""
 
 

@@ -14,9 +14,9 @@ import torch
 
 from face_prediction.commands.train import TrainOptions, run_train
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.models.checkpoint import read_checkpoint, read_tensors
 from face_prediction.models.learned import LearnedPredictor
+from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.tracking.lifting import LIPS
 from face_prediction.training.metrics import read_metrics
 from face_prediction.training.setup import locked
