@@ -23,8 +23,10 @@ from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, BootstrapEstimate, KindSummary
 from robo_manip_baselines.runs.files import write_text
 
-Place = int | tuple[int, ...]
 Format = Callable[[float], str]
+Column = tuple[str, tuple[Any, ...], Format, str | None]
+"""Cells of a Markdown table: key of `KindSummary.numbers`, place after the row's, format, and what
+stands between the bounds of the interval (None: without the interval)."""
 
 SCHEMA = "face_evaluation"
 VERSION = 1
@@ -42,14 +44,16 @@ PAPER_TABLE_2: dict[str, tuple[float, ...]] = {
     "SSIM": (0.926, 0.927, 0.928, 0.928, 0.929),
 }
 """Approach 3 by frame."""
-PER_FRAME: tuple[tuple[str, str, int | None], ...] = (
-    ("mean dU", "mean", 0),
-    ("var dU", "variance", 0),
-    ("mean dV", "mean", 1),
-    ("var dV", "variance", 1),
-    ("SSIM", "ssim", None),
+_error, _variance, _ssim = "{:.4f}".format, "{:.1e}".format, "{:.3f}".format
+_skill, _percent, _gain = "{:+.2f}".format, "{:+.1f} %".format, "{:+.3f}".format
+PER_FRAME: tuple[tuple[str, str, tuple[Any, ...], Format], ...] = (
+    ("mean dU", "mean", (..., 0), _error),
+    ("var dU", "variance", (..., 0), _variance),
+    ("mean dV", "mean", (..., 1), _error),
+    ("var dV", "variance", (..., 1), _variance),
+    ("SSIM", "ssim", (), _ssim),
 )
-"""Metrics of Table II: heading, key of `KindSummary.numbers`, axis (U, V; None: there is none)."""
+"""Metrics of Table II: heading, key of `KindSummary.numbers`, axis U or V, format."""
 TABULATED_LEVELS = (0.5, 0.9)
 """Nominal coverages in the tables."""
 INTRODUCTION = """Everybody is forecast by predictors that never saw the person. Errors are of the
@@ -63,8 +67,6 @@ the last image. Rows of the paper are its printed figures, from its own recordin
 
 _NOTHING = "–"
 _DIGITS = 9  # significant digits in CSV and JSON: more than the bootstrap is good for
-_error, _variance, _ssim = "{:.4f}".format, "{:.1e}".format, "{:.3f}".format
-_skill, _percent, _gain = "{:+.2f}".format, "{:+.1f} %".format, "{:+.3f}".format
 
 
 @dataclass(frozen=True)
@@ -114,30 +116,29 @@ def markdown_text(report: EvaluationReport) -> str:
 
 def markdown_table_1(summary: KindSummary) -> str:
     """Table I: mean and variance of abs dU and abs dV, SSIM, NME, and what is missing."""
-    numbers = summary.numbers
     makes_images = any(row.role == "network" and row.image_size for row in summary.rows)
     makes_larger = any(row.image_size > summary.common_size for row in summary.rows)
     head = ["", "mean dU", "var dU", "mean dV", "var dV", f"SSIM at {summary.common_size} px"]
     head += ["SSIM more than the copy's"] if makes_images else []
     head += ["SSIM at own size", "copy at that size"] if makes_larger else []
     head += ["NME", "missing"]
+    errors: list[Column] = []
+    for axis in range(2):
+        errors.append(("pooled_mean", (axis,), _error, "–"))
+        errors.append(("pooled_variance", (axis,), _variance, None))
     rows: list[list[str]] = []
     for i, row in enumerate(summary.rows):
-        cells = [row.name]
-        for axis in range(2):
-            cells += _cells(numbers["pooled_mean"], (i, axis), _error)
-            cells.append(_number(numbers["pooled_variance"].value[i, axis], _variance))
-        cells += _cells(numbers["pooled_ssim"], i, _ssim)
+        cells = [row.name, *_cells(summary, i, [*errors, ("pooled_ssim", (), _ssim, "–")])]
         if makes_images:
-            gain = _cells(numbers["pooled_ssim_gain"], i, _gain, " to ")
+            gain = _cells(summary, i, [("pooled_ssim_gain", (), _gain, " to ")])
             cells += [""] if row.name == PERSISTENCE else gain
         if makes_larger:
             for key in ("pooled_ssim_own_size", "pooled_ssim_copy_own_size"):
-                (ssim,) = _cells(numbers[key], i, _ssim)
+                (ssim,) = _cells(summary, i, [(key, (), _ssim, "–")])
                 is_larger = row.image_size > summary.common_size
                 cells.append(f"{ssim} at {row.image_size} px" if is_larger else "")
+        cells += _cells(summary, i, [("pooled_nme", (), _ssim, None)])
         missing, frames = int(row.missing.sum()), summary.sequences * summary.horizon
-        cells.append(_number(numbers["pooled_nme"].value[i], _ssim))
         rows.append([*cells, f"{missing} of {frames}" if missing else "0"])
     for name, values in PAPER_TABLE_1:
         printed = [_NOTHING if value is None else f"{value:.3f}" for value in values]
@@ -165,10 +166,15 @@ def results_json(report: EvaluationReport) -> str:
 def _kind_sections(summary: KindSummary, history: int) -> list[str]:
     """Sections on one kind of footage; ``history`` frames are seen, so that 71 is the next."""
     people = "person" if summary.subjects == 1 else "people"
-    rows, numbers = list(enumerate(summary.rows)), summary.numbers
+    rows = dict(enumerate(summary.rows))
     frames = [str(history + h + 1) for h in range(summary.horizon)]
     spans = [f"{history + first}–{history + last}" for first, last in GROUPS]
-    heads = [f"frames {span}" for span in spans]
+    groups = [f"frames {span}" for span in spans]
+
+    def table(head: Sequence[str], chosen: Iterable[int], *columns: Column) -> str:
+        return _table(head, ([rows[i].name, *_cells(summary, i, columns)] for i in chosen))
+
+    forecasts = [i for i, row in rows.items() if row.role != "reference"]
     parts = [
         f"## {summary.kind}: {summary.sequences} sequences of {summary.subjects} {people}, "
         f"{summary.clips} clips"
@@ -179,92 +185,72 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
         "### Table I: errors of the mouth centre in crops, and SSIM",
         markdown_table_1(summary),
         "### Distance between forecast and true mouth centre, in crops",
-        _table(
+        table(
             ["", *frames, "all"],
-            (
-                [
-                    row.name,
-                    *_cells(numbers["distance"], i, _error),
-                    *_cells(numbers["pooled_distance"], i, _error),
-                ]
-                for i, row in rows
-            ),
+            rows,
+            ("distance", (), _error, "–"),
+            ("pooled_distance", (), _error, "–"),
         ),
         "### Skill: 1 − mean distance / that of persistence",
-        _table(
+        table(
             ["", *frames, "all"],
-            (
-                [
-                    row.name,
-                    *(_number(value, _skill) for value in numbers["skill"].value[i]),
-                    *_cells(numbers["pooled_skill"], i, _skill, " to "),
-                ]
-                for i, row in rows
-                if row.role != "reference" and row.name != PERSISTENCE
-            ),
+            [i for i in forecasts if rows[i].name != PERSISTENCE],
+            ("skill", (), _skill, None),
+            ("pooled_skill", (), _skill, " to "),
         ),
         f"### Mean distance against {summary.best_baseline}, the best baseline at frames "
         f"{spans[1]}",
-        _table(
-            ["", *heads],
-            (
-                [row.name, *_cells(numbers["difference"], i, _percent, " to ")]
-                for i, row in rows
-                if row.role != "reference" and row.name != summary.best_baseline
-            ),
+        table(
+            ["", *groups],
+            [i for i in forecasts if rows[i].name != summary.best_baseline],
+            ("difference", (), _percent, " to "),
         ),
         "### Table II: by forecast frame",
     ]
-    for heading, key, axis in PER_FRAME:
-        values = numbers[key].value if axis is None else numbers[key].value[..., axis]
-        form = {"mean": _error, "variance": _variance, "ssim": _ssim}[key]
-        cells = [
-            [row.name, *(_number(value, form) for value in values[i])]
-            for i, row in rows
-            if not np.isnan(values[i]).all()
-        ]
+    for heading, key, axis, form in PER_FRAME:
+        columns: list[Column] = [(key, axis, form, None)]
+        cells = [[row.name, *_cells(summary, i, columns)] for i, row in rows.items()]
+        cells = [line for line in cells if set(line[1:]) != {_NOTHING}]
         if len(frames) == len(PAPER_TABLE_2[heading]):
             cells.append(["paper, approach 3 (other data)", *map(_ssim, PAPER_TABLE_2[heading])])
         parts.append(_table([heading, *frames], cells))
-    with_intervals = [(i, row) for i, row in rows if row.has_intervals]
-    if with_intervals:
+    cells = []
+    for i, row in rows.items():
+        for level in TABULATED_LEVELS if row.has_intervals else ():
+            k = LEVELS.index(level)
+            columns = [("coverage", (..., k), _share, None), ("pooled_coverage", (k,), _share, "–")]
+            cells.append([f"{row.name}, {level:.0%}", *_cells(summary, i, columns)])
+    if cells:
         parts.append("### Coverage of the mouth centre's intervals, U and V together, in percent")
-        cells = []
-        for i, row in with_intervals:
-            for level in TABULATED_LEVELS:
-                k = LEVELS.index(level)
-                by_frame = (_number(v, _in_percent) for v in numbers["coverage"].value[i, :, k])
-                pooled = _cells(numbers["pooled_coverage"], (i, k), _in_percent)
-                cells.append([f"{row.name}, {level:.0%}", *by_frame, *pooled])
         parts.append(_table(["", *frames, "all"], cells))
-    shuffled = [(i, row) for i, row in rows if not np.isnan(numbers["exchanged"].value[i]).all()]
+    shuffled = [i for i in rows if not np.isnan(summary.numbers["exchanged"].value[i]).all()]
     if shuffled:
         parts.append("### Mean distance with another sequence's images against with its own")
-        cells = ([r.name, *_cells(numbers["exchanged"], i, _percent, " to ")] for i, r in shuffled)
-        parts.append(_table(["", *heads, "all"], cells))
+        parts.append(table(["", *groups, "all"], shuffled, ("exchanged", (), _percent, " to ")))
     return parts
 
 
-def _cells(
-    estimate: BootstrapEstimate, place: Place, form: Format, between: str = "–"
-) -> list[str]:
-    """Cells of the numbers at ``place``, each with its interval."""
-    return [
-        _NOTHING if np.isnan(value) else f"{form(value)} ({form(low)}{between}{form(high)})"
-        for value, low, high in _bounded(estimate, place)
-    ]
+def _cells(summary: KindSummary, row: int, columns: Iterable[Column]) -> list[str]:
+    """Cells of one row."""
+    cells: list[str] = []
+    for key, place, form, between in columns:
+        for value, *bounds in _bounded(summary, key, (row, *place)):
+            cell = _NOTHING if np.isnan(value) else form(value)
+            if between is not None and cell != _NOTHING:
+                cell += f" ({between.join(map(form, bounds))})"
+            cells.append(cell)
+    return cells
 
 
-def _bounded(estimate: BootstrapEstimate, place: Place) -> Iterable[tuple[float, float, float]]:
-    parts = (np.ravel(part[place]) for part in (estimate.value, estimate.low, estimate.high))
-    return zip(*parts, strict=True)
+def _bounded(summary: KindSummary, key: str, place: tuple[Any, ...]) -> np.ndarray:
+    """Values with their bounds (n, 3)."""
+    number = summary.numbers[key]
+    return np.stack(
+        [np.ravel(part[place]) for part in (number.value, number.low, number.high)], axis=-1
+    )
 
 
-def _number(value: float, form: Format) -> str:
-    return _NOTHING if np.isnan(value) else form(value)
-
-
-def _in_percent(value: float) -> str:
+def _share(value: float) -> str:
     return f"{100 * value:.1f}"
 
 
@@ -275,26 +261,27 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def _table_1_csv(report: EvaluationReport) -> str:
     """A line for each kind of footage and row; the bounds of intervals in columns of their own."""
-    names = ("mean_du", "var_du", "mean_dv", "var_dv", "ssim", "ssim_own_size",
-             "ssim_copy_own_size", "nme", "distance", "skill")  # fmt: skip
+    columns: list[tuple[str, str, tuple[int, ...]]] = []
+    for axis, name in enumerate(("du", "dv")):
+        columns.append((f"mean_{name}", "pooled_mean", (axis,)))
+        columns.append((f"var_{name}", "pooled_variance", (axis,)))
+    for name in ("ssim", "ssim_own_size", "ssim_copy_own_size", "nme", "distance", "skill"):
+        columns.append((name, f"pooled_{name}", ()))
     head = ["kind", "row", "role", "sequences", "subjects", "missing", "picture_size", "ssim_size"]
-    lines: list[list[Any]] = [head + [f"{n}{end}" for n in names for end in ("", "_low", "_high")]]
+    head += [f"{name}{end}" for name, _, _ in columns for end in ("", "_low", "_high")]
+    lines: list[list[Any]] = [head]
     for summary in report.kinds:
-        numbers = summary.numbers
         for i, row in enumerate(summary.rows):
             line = [summary.kind, row.name, row.role, summary.sequences, summary.subjects]
             line += [row.missing.sum(), row.image_size or "", summary.common_size]
-            for axis in range(2):
-                line += _csv_cells(numbers["pooled_mean"], (i, axis))
-                line += _csv_cells(numbers["pooled_variance"], (i, axis))
-            for name in names[4:]:
-                line += _csv_cells(numbers[f"pooled_{name}"], i)
+            for _, key, place in columns:
+                line += _csv_cells(summary, key, (i, *place))
             lines.append(line)
     for name, values in PAPER_TABLE_1:
         line = ["paper (other data)", name, "paper", 100, "", "", 256, 256]
         for value in values:
-            line += ["" if value is None else value, "", ""]
-        lines.append(line + [""] * (len(lines[0]) - len(line)))
+            line += [value, "", ""]
+        lines.append(line + [""] * (len(head) - len(line)))
     return _csv(lines)
 
 
@@ -303,14 +290,15 @@ def _table_2_csv(report: EvaluationReport) -> str:
     lines: list[list[Any]] = [
         ["kind", "row", "role", "metric", "frame", "value", "low", "high"],
     ]
-    others = (("distance", "distance", None), ("skill", "skill", None), ("NME", "nme", None))
+    metrics = [(heading, key, axis) for heading, key, axis, _ in PER_FRAME]
+    metrics += [("distance", "distance", ()), ("skill", "skill", ()), ("NME", "nme", ())]
     for summary in report.kinds:
         for i, row in enumerate(summary.rows):
-            for heading, key, axis in (*PER_FRAME, *others):
+            for heading, key, axis in metrics:
+                cells = _csv_cells(summary, key, (i, *axis))
                 for h in range(summary.horizon):
-                    place = (i, h) if axis is None else (i, h, axis)
                     line = [summary.kind, row.name, row.role, heading, report.history + h + 1]
-                    lines.append(line + _csv_cells(summary.numbers[key], place))
+                    lines.append(line + cells[3 * h : 3 * h + 3])
     for heading, values in PAPER_TABLE_2.items():
         for frame, value in enumerate(values, start=71):
             line = ["paper (other data)", "approach 3, cross-attention", "paper", heading, frame]
@@ -318,9 +306,9 @@ def _table_2_csv(report: EvaluationReport) -> str:
     return _csv(lines)
 
 
-def _csv_cells(estimate: BootstrapEstimate, place: Place) -> list[str]:
-    ((value, low, high),) = _bounded(estimate, place)
-    return ["" if np.isnan(part) else f"{part:.{_DIGITS}g}" for part in (value, low, high)]
+def _csv_cells(summary: KindSummary, key: str, place: tuple[Any, ...]) -> list[str]:
+    numbers = _bounded(summary, key, place).ravel()
+    return ["" if np.isnan(number) else f"{number:.{_DIGITS}g}" for number in numbers]
 
 
 def _csv(lines: Iterable[Iterable[Any]]) -> str:

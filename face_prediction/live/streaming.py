@@ -103,15 +103,14 @@ class NetworkForecaster:
     """
 
     def __init__(self, network: PredictorModel, name: str) -> None:
-        self._network = network.eval()
+        self._network, self._name = network.eval(), name
         self._device = next(network.parameters()).device
         self.needs, self.span = network.needs, network.span
         # a first run, which takes longer than others, before a camera waits for it
         still = np.zeros((network.history, NUM_LANDMARKS, 2), dtype=np.float32)
         black = np.zeros((self.span, self.needs.size, self.needs.size, 3), dtype=np.uint8)
         features = self.features(still[: self.span], black)
-        if self._decode(still, [features] * (self.needs.frames - self.span + 1), black[-1]) is None:
-            raise RequestError(f"{name}: forecasts images and no landmarks; use another network")
+        self.forecast(still, [features] * (self.needs.frames - self.span + 1), black[-1])
 
     def features(self, landmarks: NDArray[np.float32], images: NDArray[np.uint8]) -> torch.Tensor:
         """Features (1, 1, ...) of one frame, from landmarks (K, L, 2) and images (K, S, S, 3)."""
@@ -126,27 +125,25 @@ class NetworkForecaster:
         features: list[torch.Tensor],
         last_image: NDArray[np.uint8],
     ) -> NDArray[np.float32]:
-        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features."""
-        ahead = self._decode(landmarks[-self._network.history :], features, last_image)
-        assert ahead is not None
-        return ahead
+        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features.
 
-    def _decode(
-        self,
-        landmarks: NDArray[np.float32],
-        features: list[torch.Tensor],
-        last_image: NDArray[np.uint8],
-    ) -> NDArray[np.float32] | None:
+        Raises:
+            RequestError: the network forecasts no landmarks.
+        """
         import torch
 
         with torch.inference_mode():
-            output = self._network.decode(
-                self._tensor(landmarks),
+            ahead = self._network.decode(
+                self._tensor(landmarks[-self._network.history :]),
                 torch.cat(features, dim=1),
                 self._tensor(last_image),
                 make_pictures=False,
+            ).landmarks
+        if ahead is None:
+            raise RequestError(
+                f"{self._name}: forecasts images and no landmarks; use another network"
             )
-        return None if output.landmarks is None else output.landmarks[0].float().cpu().numpy()
+        return ahead[0].float().cpu().numpy()
 
     def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
         """A batch of one, on the network's device."""
