@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -160,59 +160,52 @@ class PredictorErrorStats:
     residuals: tuple[ResidualRun, ...] = ()
 
     def __post_init__(self) -> None:
-        size = len(self.horizons)
-        levels = (0.0, *self.quantile_levels, 1.0)
+        for key, holds, promise in self._promises():
+            if not holds:
+                raise RequestError(f"'{key}' {promise}")
+
+    def _promises(self) -> Iterator[tuple[str, bool | np.bool_, str]]:
+        """Keys, whether their promises hold, and the promises."""
+        levels = np.array([0.0, *self.quantile_levels, 1.0])
         is_hash = re.fullmatch("[0-9a-f]{64}", self.data_sha256) is not None
-        for key, holds, promise in (
-            ("predictor", bool(self.predictor), "must be named"),
-            ("fps", 0 < self.fps < np.inf, "must be positive"),
-            ("stride_frames", self.stride_frames >= 1, "must be 1 or more"),
-            ("subjects", 1 <= self.subjects <= self.sequences, "must be 1 to 'sequences'"),
-            ("data_sha256", is_hash, "must be 64 hexadecimal digits"),
-            ("equations", self.equations == EQUATIONS, f"must be {list(EQUATIONS)}"),
-            ("quantile_levels", len(levels) > 2, "must not be empty"),
-            ("quantile_levels", np.all(np.diff(levels) > 0), "must rise, between 0 and 1"),
-            ("horizons", size > 0, "must be 1, 2, ... frames"),
-        ):
-            _require(bool(holds), key, promise)
-        for number, horizon in enumerate(self.horizons, start=1):
-            _require(horizon.frames == number, "horizons", "must be 1, 2, ... frames")
-            self._check_horizon(horizon)
+        yield "predictor", bool(self.predictor), "must be named"
+        yield "fps", 0 < self.fps < np.inf, "must be positive"
+        yield "stride_frames", self.stride_frames >= 1, "must be 1 or more"
+        yield "subjects", 1 <= self.subjects <= self.sequences, "must be 1 to 'sequences'"
+        yield "data_sha256", is_hash, "must be 64 hexadecimal digits"
+        yield "equations", self.equations == EQUATIONS, f"must be {list(EQUATIONS)}"
+        yield "quantile_levels", len(levels) > 2, "must not be empty"
+        yield "quantile_levels", np.all(np.diff(levels) > 0), "must rise, between 0 and 1"
+        size = len(self.horizons)
+        frames = [horizon.frames for horizon in self.horizons]
+        is_counted = size > 0 and frames == list(range(1, size + 1))
+        yield "horizons", is_counted, "must be 1, 2, ... frames"
+        for number, horizon in enumerate(self.horizons):
+            key = f"horizons[{number}]"
+            mean, variance, bias, metres = (
+                _finite(getattr(horizon, name), f"{key}.{name}", (2,))
+                for name in ("mean_abs", "var_abs", "bias", "mean_abs_m")
+            )
+            quantiles = _finite(horizon.quantiles, f"{key}.quantiles", (2, len(levels) - 2))
+            total = horizon.forecasts + horizon.missing
+            is_complete = total == self.sequences and 1 <= horizon.forecasts <= total
+            is_converted = np.allclose(self.camera.metres(mean), metres, _TOLERANCE, 0.0)
+            is_smaller = np.all(np.abs(bias) <= mean * (1 + _TOLERANCE))
+            yield f"{key}.mean_abs", np.all(mean >= 0), "must not be negative"
+            yield f"{key}.var_abs", np.all(variance >= 0), "must not be negative"
+            yield f"{key}.bias", is_smaller, "must not exceed 'mean_abs'"
+            yield f"{key}.mean_abs_m", is_converted, "does not follow from 'mean_abs' and 'camera'"
+            yield f"{key}.quantiles", np.all(np.diff(quantiles) >= 0), "must rise"
+            promise = "must be 1 or more and with 'missing' make 'sequences'"
+            yield f"{key}.forecasts", is_complete, promise
         covariance = _finite(self.covariance, "covariance", (2 * size, 2 * size))
-        _require(
-            np.array_equal(covariance, covariance.T)
-            and bool(np.linalg.eigvalsh(covariance)[0] >= -_TOLERANCE * np.trace(covariance)),
-            "covariance",
-            "must be symmetric without negative eigenvalues",
-        )
+        least = np.linalg.eigvalsh(covariance)[0]
+        is_positive = least >= -_TOLERANCE * np.trace(covariance)
+        is_covariance = np.array_equal(covariance, covariance.T) and is_positive
+        yield "covariance", is_covariance, "must be symmetric without negative eigenvalues"
         _finite(self.autocorrelation, "autocorrelation", (None, size, 2))
         for number, run in enumerate(self.residuals):
             _finite(run.values, f"residuals[{number}]", (None, size, 2))
-
-    def _check_horizon(self, horizon: HorizonErrors) -> None:
-        where = f"horizons[{horizon.frames - 1}]"
-        mean, variance, bias, metres = (
-            _finite(getattr(horizon, key), f"{where}.{key}", (2,))
-            for key in ("mean_abs", "var_abs", "bias", "mean_abs_m")
-        )
-        shape = (2, len(self.quantile_levels))
-        quantiles = _finite(horizon.quantiles, f"{where}.quantiles", shape)
-        total = horizon.forecasts + horizon.missing
-        is_complete = horizon.forecasts >= 1 and total == self.sequences and horizon.missing >= 0
-        converted = self.camera.metres(mean)
-        for key, holds, promise in (
-            ("mean_abs", np.all(mean >= 0), "must not be negative"),
-            ("var_abs", np.all(variance >= 0), "must not be negative"),
-            ("bias", np.all(np.abs(bias) <= mean * (1 + _TOLERANCE)), "must not exceed 'mean_abs'"),
-            (
-                "mean_abs_m",
-                np.allclose(converted, metres, _TOLERANCE, 0.0),
-                "does not follow from 'mean_abs' and 'camera'",
-            ),
-            ("quantiles", np.all(np.diff(quantiles) >= 0), "must rise"),
-            ("forecasts", is_complete, "must be 1 or more and with 'missing' make 'sequences'"),
-        ):
-            _require(bool(holds), f"{where}.{key}", promise)
 
 
 _NESTED = {kind.__name__: kind for kind in (Camera, HorizonErrors, ResidualRun)}
@@ -426,11 +419,6 @@ def _shortened(runs: Sequence[ResidualRun], frames: int | None) -> tuple[Residua
     return tuple(kept)
 
 
-def _require(holds: bool, key: str, promise: str) -> None:
-    if not holds:
-        raise RequestError(f"'{key}' {promise}")
-
-
 def _finite(values: Any, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
     """Nested tuples of numbers as an array of that shape; None: any length."""
     try:
@@ -441,7 +429,8 @@ def _finite(values: Any, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
     fits = array.ndim == len(shape) and all(
         length in (None, found) for length, found in zip(shape, array.shape, strict=True)
     )
-    _require(fits and bool(np.all(np.isfinite(array))), key, f"must be finite, of shape ({wanted})")
+    if not (fits and np.all(np.isfinite(array))):
+        raise RequestError(f"'{key}' must be finite, of shape ({wanted})")
     return array
 
 

@@ -58,10 +58,7 @@ def new_matplotlib_figure(width: float, height: float, layout: str | None = "con
 
 
 def write_figures(
-    folder: Path,
-    setup: EvaluationSetup,
-    scores: EvaluationScores,
-    summaries: Sequence[KindSummary],
+    folder: Path, setup: EvaluationSetup, scores: EvaluationScores, summaries: Sequence[KindSummary]
 ) -> None:
     """Write all figures.
 

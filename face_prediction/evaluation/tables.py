@@ -20,7 +20,7 @@ import numpy as np
 from face_prediction.evaluation.error_stats import compact_json
 from face_prediction.evaluation.errors import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
-from face_prediction.evaluation.statistics import GROUPS, BootstrapEstimate, KindSummary
+from face_prediction.evaluation.statistics import GROUPS, KindSummary
 from robo_manip_baselines.runs.files import write_text
 
 Format = Callable[[float], str]
@@ -287,9 +287,7 @@ def _table_1_csv(report: EvaluationReport) -> str:
 
 def _table_2_csv(report: EvaluationReport) -> str:
     """A line for each kind, row, metric and frame."""
-    lines: list[list[Any]] = [
-        ["kind", "row", "role", "metric", "frame", "value", "low", "high"],
-    ]
+    lines: list[list[Any]] = [["kind", "row", "role", "metric", "frame", "value", "low", "high"]]
     metrics = [(heading, key, axis) for heading, key, axis, _ in PER_FRAME]
     metrics += [("distance", "distance", ()), ("skill", "skill", ()), ("NME", "nme", ())]
     for summary in report.kinds:

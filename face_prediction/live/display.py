@@ -136,10 +136,7 @@ def draw_text(image: NDArray[np.uint8], lines: Sequence[tuple[str, Colour]]) -> 
 
 
 def _draw_path(
-    image: NDArray[np.uint8],
-    lips: NDArray[np.floating],
-    path: NDArray[np.floating],
-    radius: float,
+    image: NDArray[np.uint8], lips: NDArray[np.floating], path: NDArray[np.floating], radius: float
 ) -> None:
     """Dots for the lips (P, 2), the mouth now, and in every later frame (H + 1, 2), in pixels."""
     # OpenCV counts from the middle of the first pixel

@@ -42,9 +42,7 @@ def times_back(now: float, count: int, fps: float) -> NDArray[np.float64]:
 
 
 def landmarks_at(
-    wanted: NDArray[np.float64],
-    times: NDArray[np.float64],
-    landmarks: NDArray[np.floating],
+    wanted: NDArray[np.float64], times: NDArray[np.float64], landmarks: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Landmarks (T, L, C) at ``wanted`` (T,), none later than the last of ``times``.
 
