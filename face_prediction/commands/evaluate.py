@@ -50,33 +50,36 @@ class EvaluateOptions:
     one network for different folds are one row. Baselines are fitted to all other folds.
 
     Example: face-prediction evaluate --dataset face_dataset --checkpoints checkpoints/residual_*
+
+    Attributes:
+        dataset: folder made by build-dataset.
+        checkpoints: folders written by train; none: baselines only.
+        baselines: baselines to fit: all, or names; persistence is always there.
+        kinds: kinds of footage to report on, each by itself.
+        out: folder for tables and figures.
+        detector_model: MediaPipe's face_landmarker.task, for networks that forecast images only.
+            By default the one in ~/.cache/face_prediction (or $XDG_CACHE_HOME/face_prediction).
+        seed: of the bootstrap, of what --max_sequences draws and of the permutation of
+            --shuffle_images.
+        max_sequences: sequences of each kind, at most; None: all.
+        resamples: resamples of the bootstrap.
+        shuffle_images: ablation: also give every network the images of other sequences, and report
+            how much worse it gets.
+        figures: draw figures and a video. They show people's faces: do not publish them.
+        progress: show a progress bar.
     """
 
-    #: Folder made by build-dataset.
     dataset: Path
-    #: Folders written by train; none: baselines only.
     checkpoints: tuple[Path, ...] = ()
-    #: Baselines to fit: all, or names; persistence is always there.
     baselines: tuple[str, ...] = ("all",)
-    #: Kinds of footage to report on, each by itself.
     kinds: tuple[str, ...] = KINDS
-    #: Folder for tables and figures.
     out: Path = Path("results/faces")
-    #: MediaPipe's face_landmarker.task, for networks that forecast images only. By default the
-    #: one in ~/.cache/face_prediction (or $XDG_CACHE_HOME/face_prediction).
     detector_model: Path | None = None
-    #: Of the bootstrap, of what --max_sequences draws and of the permutation of --shuffle_images.
     seed: int = 0
-    #: Sequences of each kind, at most; None: all.
     max_sequences: int | None = None
-    #: Resamples of the bootstrap.
     resamples: int = 2000
-    #: Ablation: also give every network the images of other sequences, and report how much worse
-    #: it gets.
     shuffle_images: Annotated[bool, tyro.conf.arg(aliases=("--shuffle_pictures",))] = False
-    #: Draw figures and a video. They show people's faces: do not publish them.
     figures: bool = True
-    #: Show a progress bar.
     progress: bool = True
 
 

@@ -48,39 +48,43 @@ class ExportStatsOptions:
     test fold, or by a baseline fitted to the other folds.
 
     Example: face-prediction export-stats --dataset face_dataset --baseline ar_landmarks
+
+    Attributes:
+        dataset: folder made by build-dataset.
+        checkpoints: folders of trained networks of one kind, each of another test fold. Sequences
+            of folds that none of them tests are left out.
+        baseline: a forecaster that is fitted here, instead.
+        library: a motion library with forecasts (face-prediction predict), instead: its forecasts
+            are measured, one a frame, where the dataset's sequences are ``stride`` frames apart.
+            Clips that are in the library are in the dataset, which gives their kind and the size
+            of their crops.
+        kind: footage to measure on.
+        out: the file to write.
+        crop_width: side of the crop as a share of the camera's image width. By default the median
+            size of the crops, in metres at the mouth, as the camera below sees it.
+        crop_height: the same of the image height.
+        fov_x_deg: degrees across, of the camera that errors are converted to metres for.
+        fov_y_deg: degrees up.
+        depth_m: metres from that camera to the mouth.
+        keep_runs: whether the file holds the errors themselves, for error "empirical" of the
+            robot's side.
+        max_run_frames: forecasts of each clip that the file holds at most; None: all.
+        progress: show a progress bar.
     """
 
-    #: Folder made by build-dataset.
     dataset: Path
-    #: Folders of trained networks of one kind, each of another test fold. Sequences of folds that
-    #: none of them tests are left out.
     checkpoints: tuple[Path, ...] = ()
-    #: A forecaster that is fitted here, instead.
     baseline: str | None = None
-    #: A motion library with forecasts (face-prediction predict), instead: its forecasts are
-    #: measured, one a frame, where the dataset's sequences are ``stride`` frames apart. Clips that
-    #: are in the library are in the dataset, which gives their kind and the size of their crops.
     library: Path | None = None
-    #: Footage to measure on.
     kind: Literal["natural", "head_motion", "grid"] = "natural"
-    #: The file to write.
     out: Path = Path("error_stats.json")
-    #: Side of the crop as a share of the camera's image width. By default the median size of
-    #: the crops, in metres at the mouth, as the camera below sees it.
     crop_width: float | None = None
-    #: The same of the image height.
     crop_height: float | None = None
-    #: Degrees across, of the camera that errors are converted to metres for.
     fov_x_deg: float = PAPER_CAMERA.fov_x_deg
-    #: Degrees up.
     fov_y_deg: float = PAPER_CAMERA.fov_y_deg
-    #: Metres from that camera to the mouth.
     depth_m: float = PAPER_CAMERA.depth_m
-    #: Whether the file holds the errors themselves, for error "empirical" of the robot's side.
     keep_runs: bool = True
-    #: Forecasts of each clip that the file holds at most; None: all.
     max_run_frames: int | None = None
-    #: Show a progress bar.
     progress: bool = True
 
 

@@ -39,24 +39,27 @@ class LiveOptions:
     """Follow a face, forecast its mouth, and draw both on the image, with the times they take.
 
     Example: face-prediction live --video clip.mp4 --out forecast.mp4
+
+    Attributes:
+        camera: number of a camera, 0 being the first.
+        video: a video file, instead.
+        checkpoint: folder of a trained network; shipped: the one that comes with the package; or
+            the name of a baseline.
+        dataset: folder made by build-dataset, that a baseline with parameters is fitted to.
+        out: video file (H.264, .mp4) to write; by default a window is opened.
+        detector_model: MediaPipe's face_landmarker.task. By default the one in
+            ~/.cache/face_prediction (or $XDG_CACHE_HOME/face_prediction), downloaded once if there
+            is a network.
+        seconds: stop after so many seconds of video; None: at its end, with Escape or q in the
+            window, or with Ctrl-C.
     """
 
-    #: Number of a camera, 0 being the first.
     camera: int | None = None
-    #: A video file, instead.
     video: Path | None = None
-    #: Folder of a trained network; shipped: the one that comes with the package; or the name of a
-    #: baseline.
     checkpoint: str = SHIPPED
-    #: Folder made by build-dataset, that a baseline with parameters is fitted to.
     dataset: Path | None = None
-    #: Video file (H.264, .mp4) to write; by default a window is opened.
     out: Path | None = None
-    #: MediaPipe's face_landmarker.task. By default the one in ~/.cache/face_prediction (or
-    #: $XDG_CACHE_HOME/face_prediction), downloaded once if there is a network.
     detector_model: Path | None = None
-    #: Stop after so many seconds of video; None: at its end, with Escape or q in the window, or
-    #: with Ctrl-C.
     seconds: float | None = None
 
 

@@ -216,7 +216,9 @@ def _draw_curves(
             handles.setdefault(row.name, line)
             if has_band(row, summary.best_baseline):
                 axes.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize="small")
+    columns = min(4, 2 * len(summaries))  # more would be wider than one panel
+    place = {"loc": "outside lower center", "ncols": columns, "fontsize": "small"}
+    figure.legend(handles.values(), handles, **place)
     return figure, panels
 
 
