@@ -21,21 +21,23 @@ import numpy as np
 
 from face_prediction.dataset.sequences import clip_frames, find_sequences
 from face_prediction.dataset.settings import KINDS, SequenceSettings, kind_of
-from face_prediction.evaluation import (
-    Interval,
-    cluster_bootstrap,
+from face_prediction.evaluation.error_stats import (
+    MouthResiduals,
     data_hash,
     measure_error_stats,
-    mouth_distances,
-    mouth_residuals,
-    normalised_mean_errors,
-    save_error_stats,
-    skill,
+    save_predictor_error_stats,
 )
-from face_prediction.evaluation.errors import mouth_errors
+from face_prediction.evaluation.statistics import bootstrap_mean
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
 from face_prediction.forecast.interface import subject_folds
 from face_prediction.motion.library import read_attributions
+from face_prediction.prediction.errors import (
+    mouth_distances,
+    mouth_errors,
+    mouth_residuals,
+    normalised_mean_errors,
+    skill,
+)
 from face_prediction.tracking.tracks import load_track
 
 PERSISTENCE = "persistence"
@@ -152,9 +154,12 @@ def print_kind(kind: str, windows: Windows, scores: dict[str, Scores], resamples
     print("|---|" + "---|" * (len(horizons) + 2))
     for name, result in scores.items():
         size = np.abs(result.residuals[rows]).mean(axis=2)  # (N, H)
-        interval = cluster_bootstrap(size.mean(axis=1), subjects, resamples=resamples)
+        interval = bootstrap_mean(size.mean(axis=1), subjects, resamples=resamples)
         cells = " | ".join(f"{value:.4f}" for value in size.mean(axis=0))
-        print(f"| {name} | {cells} | {float(interval.estimate):.4f} | {_bounds(interval)} |")
+        print(
+            f"| {name} | {cells} | {float(interval.value):.4f} "
+            f"| {float(interval.low):.4f}–{float(interval.high):.4f} |"
+        )
     print("\n| | mean dU | var dU | mean dV | var dV | NME | skill 1 | skill 3 | skill 5 |")
     print("|---|" + "---|" * 8)
     reference = mouth_distances(scores[PERSISTENCE].residuals[rows])
@@ -169,10 +174,6 @@ def print_kind(kind: str, windows: Windows, scores: dict[str, Scores], resamples
         )
 
 
-def _bounds(interval: Interval) -> str:
-    return f"{float(interval.low):.4f}–{float(interval.high):.4f}"
-
-
 def write_stats(
     folder: Path, windows: Windows, scores: dict[str, Scores], settings: SequenceSettings
 ) -> None:
@@ -180,20 +181,19 @@ def write_stats(
     for name, result in scores.items():
         for kind in sorted(set(windows.kinds)):
             rows = windows.kinds == kind
-            stats = measure_error_stats(
+            residuals = MouthResiduals(
                 result.residuals[rows],
                 windows.clips[rows].tolist(),
                 windows.subjects[rows].tolist(),
                 windows.starts[rows].tolist(),
+                stride_frames=settings.stride,
                 predictor=name,
-                footage=kind,
                 data_sha256=data_hash(
                     windows.landmarks[rows, settings.history :], result.forecasts[rows]
                 ),
-                stride_frames=settings.stride,
-                fps=settings.fps,
             )
-            save_error_stats(folder / f"error_stats_{name}_{kind}.json", stats)
+            stats = measure_error_stats(residuals, kind, fps=settings.fps)
+            save_predictor_error_stats(folder / f"error_stats_{name}_{kind}.json", stats)
 
 
 def main() -> None:

@@ -23,12 +23,11 @@ import torch
 
 from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.evaluation.setup import BaselinePredictor
+from face_prediction.evaluation.predictors import BaselinePredictor
 from face_prediction.forecast.simple import Persistence
 from face_prediction.live.streaming import (
-    Forecasting,
-    LandmarkForecasting,
-    NetworkForecasting,
+    LandmarkForecaster,
+    NetworkForecaster,
     StreamingPredictor,
 )
 from face_prediction.models.interface import History, PredictorModel
@@ -73,11 +72,11 @@ def frame_times(run: Callable[[int], object], first: int, count: int) -> Taken:
     return Taken(*1e3 * taken)
 
 
-def streamed(forecasting: Forecasting, frames: int) -> Taken:
+def streamed(forecaster: LandmarkForecaster | NetworkForecaster, frames: int) -> Taken:
     """Of a streaming predictor, once it knows a whole history."""
     warm = SETTINGS.history + 5
     landmarks, images = drawn_faces(warm + frames)
-    stream = StreamingPredictor(forecasting, SETTINGS)
+    stream = StreamingPredictor(forecaster, SETTINGS)
 
     def run(number: int) -> None:
         stream.update(number / SETTINGS.fps, landmarks[number], images[number])
@@ -90,7 +89,7 @@ def whole(network: PredictorModel, frames: int) -> Taken:
     """Of a network that encodes its whole history in every frame."""
     warm = SETTINGS.history
     landmarks, images = drawn_faces(warm + frames)
-    crop = StreamingPredictor(LandmarkForecasting(_persistence(), 5), SETTINGS).update(
+    crop = StreamingPredictor(LandmarkForecaster(_persistence(), 5), SETTINGS).update(
         0.0, landmarks[0], images[0]
     )
     assert crop is not None
@@ -120,12 +119,12 @@ def _persistence() -> BaselinePredictor:
 def row(name: str, preset: str, frames: int) -> str:
     """One line of the table."""
     if name == PERSISTENCE:
-        ours = streamed(LandmarkForecasting(_persistence(), 5), frames)
+        ours = streamed(LandmarkForecaster(_persistence(), 5), frames)
         return f"| {name} | | | {_cells(ours)} | | |"
     torch.manual_seed(0)
     network = make_predictor_model(name, preset_settings(name, preset)[0]).eval()
     needs = network.needs
-    ours = streamed(NetworkForecasting(network, name), frames)
+    ours = streamed(NetworkForecaster(network, name), frames)
     theirs = whole(network, max(frames // 5, 4))
     ratio = theirs.processor.mean() / ours.processor.mean()
     return (

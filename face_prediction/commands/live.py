@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from importlib.resources import files
@@ -13,54 +12,54 @@ import numpy as np
 
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.evaluation.setup import BaselinePredictor
+from face_prediction.evaluation.predictors import BaselinePredictor
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
-from face_prediction.live.loop import Summary, run_loop
-from face_prediction.live.sinks import VideoFile, Window
-from face_prediction.live.sources import FaceFinder, camera_frames, open_camera, video_frames
-from face_prediction.live.streaming import (
-    Forecasting,
-    LandmarkForecasting,
-    NetworkForecasting,
-    StreamingPredictor,
-)
+from face_prediction.live.display import video_sink, window_sink
+from face_prediction.live.loop import LiveStatistics, run_loop
+from face_prediction.live.sources import face_finder, live_frames
+from face_prediction.live.streaming import LandmarkForecaster, NetworkForecaster, StreamingPredictor
 from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
-from face_prediction.tracking.video import VideoFrame, VideoReader, require_video
+from face_prediction.tracking.video import VideoReader, require_video
 from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
 
-#: Frames ahead (paper, IV.A).
 HORIZON = 5
+"""Frames ahead (paper, IV.A)."""
 SHIPPED = "shipped"
-#: Baselines that are fitted to nothing.
 UNFITTED = ("persistence", "constant_velocity", "line")
+"""Baselines without parameters."""
+
+LiveForecaster = LandmarkForecaster | NetworkForecaster
 
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Follow a face, forecast its mouth, and show both on the picture, with the times they take.
+    """Follow a face, forecast its mouth, and draw both on the image, with the times they take.
 
     Example: face-prediction live --video clip.mp4 --out forecast.mp4
+
+    Attributes:
+        camera: number of a camera, 0 being the first.
+        video: a video file, instead.
+        checkpoint: folder of a trained network; shipped: the one that comes with the package; or
+            the name of a baseline.
+        dataset: folder made by build-dataset, that a baseline with parameters is fitted to.
+        out: video file (H.264, .mp4) to write; by default a window is opened.
+        detector_model: MediaPipe's face_landmarker.task. By default the one in
+            ~/.cache/face_prediction (or $XDG_CACHE_HOME/face_prediction), downloaded once if there
+            is a network.
+        seconds: stop after so many seconds of video; None: at its end, with Escape or q in the
+            window, or with Ctrl-C.
     """
 
-    #: Number of a camera, 0 being the first.
     camera: int | None = None
-    #: A video file, instead.
     video: Path | None = None
-    #: Folder of a trained network; shipped: the one that comes with the package; or the name of a
-    #: baseline.
     checkpoint: str = SHIPPED
-    #: Folder made by build-dataset, that a baseline with parameters is fitted to.
     dataset: Path | None = None
-    #: Video file (H.264, .mp4) to write; by default a window is opened.
     out: Path | None = None
-    #: MediaPipe's face_landmarker.task. By default the one in ~/.cache/face_prediction (or
-    #: $XDG_CACHE_HOME/face_prediction), downloaded once if there is a network.
     detector_model: Path | None = None
-    #: Stop after so many seconds of video; None: at its end, with Escape or q in the window, or
-    #: with Ctrl-C.
     seconds: float | None = None
 
 
@@ -71,105 +70,94 @@ def run_live(options: LiveOptions) -> int:
         0, or 130 when it was interrupted; a file that was being written is then complete.
 
     Raises:
-        RequestError: camera, video, network or detector cannot be used, or nothing can be shown.
+        RequestError: camera, video, network or detector cannot be used, or there is no display.
     """
-    if (options.camera is None) == (options.video is None):
+    check_live_options(options)
+    name, forecaster, settings = load_forecaster(options.checkpoint, options.dataset)
+    model = find_model(options.detector_model)
+    rate = settings.fps
+    if options.video is not None:
+        with VideoReader(options.video) as reader:
+            rate = reader.info.average_rate or rate
+    statistics = LiveStatistics()
+    code = 0
+    with ExitStack() as stack:
+        sink = window_sink() if options.out is None else video_sink(options.out, rate)
+        show = stack.enter_context(sink)
+        find = stack.enter_context(face_finder(model))
+        frames = stack.enter_context(
+            closing(live_frames(options.video, options.camera, options.seconds))
+        )
+        predictor = StreamingPredictor(forecaster, settings)
+        try:
+            run_loop(frames, find, predictor, show, name, settings.history, statistics)
+        except KeyboardInterrupt:
+            if not statistics.frames:
+                raise
+            code = 130
+    if options.out is not None:
+        logger.info("%s: %d frames", options.out, statistics.frames)
+    logger.info(
+        "face in %d of %d frames, crops laid: %d",
+        *(statistics.faces, statistics.frames, statistics.crops),
+    )
+    print(statistics.times_table())  # noqa: T201
+    return code
+
+
+def check_live_options(options: LiveOptions) -> None:
+    """Check what can be checked before anything is read.
+
+    Raises:
+        RequestError: an option is out of its range, or the file to write is one that is read.
+    """
+    out, video = options.out, options.video
+    if (options.camera is None) == (video is None):
         raise RequestError("give either --camera NUMBER or --video FILE")
     if options.seconds is not None and not options.seconds > 0:
         raise RequestError(f"--seconds {options.seconds}: must be positive")
-    if options.video is not None:
-        require_video(options.video)
-    refuse_folder_or_source(options)
-    name, forecasting, settings = load_forecasting(options.checkpoint, options.dataset)
-    model = find_model(options.detector_model)
-    summary = Summary()
-    is_interrupted = False
-    with ExitStack() as stack:
-        sink = VideoFile(options.out, rate_of(options.video)) if options.out else Window()
-        finder = stack.enter_context(FaceFinder(model))
-        frames = stack.enter_context(closing(frames_of(options)))
-        stack.enter_context(sink)
-        try:
-            run_loop(
-                frames,
-                finder.find,
-                StreamingPredictor(forecasting, settings),
-                sink,
-                name,
-                settings.history,
-                summary,
-            )
-        except KeyboardInterrupt:
-            is_interrupted = True
-            if not summary.frames:
-                raise
-    if options.out is not None:
-        logger.info("%s: %d frames", options.out, summary.frames)
-    logger.info(
-        "face in %d of %d frames, crops laid: %d", summary.faces, summary.frames, summary.crops
-    )
-    print(summary.times.table())  # noqa: T201
-    return 130 if is_interrupted else 0
-
-
-def frames_of(options: LiveOptions) -> Generator[VideoFrame, None, None]:
-    """The images of the camera or the video, as long as they are wanted.
-
-    Raises:
-        RequestError: there are none.
-    """
-    if options.video is not None:
-        frames = video_frames(options.video)
-    else:
-        assert options.camera is not None
-        frames = camera_frames(open_camera(options.camera))
-    limit = np.inf if options.seconds is None else options.seconds
-    with closing(frames):
-        first: float | None = None
-        for frame in frames:
-            first = frame.time if first is None else first
-            if frame.time - first >= limit:
-                return
-            yield frame
-
-
-def rate_of(video: Path | None) -> float:
-    """About how many frames a second will come."""
-    if video is None:
-        return SequenceSettings.fps
-    with VideoReader(video) as reader:
-        return reader.info.average_rate
-
-
-def refuse_folder_or_source(options: LiveOptions) -> None:
-    """Check that the file to write is none that is read, and no folder.
-
-    Raises:
-        RequestError: it is.
-    """
-    if options.out is None:
+    if video is not None:
+        require_video(video)
+    if out is None:
         return
-    if options.out.is_dir():
-        raise RequestError(f"--out {options.out}: is a folder; name a file")
-    if options.out.suffix.lower() != ".mp4":
-        raise RequestError(f"--out {options.out}: name an .mp4 file")
-    if options.video is not None and options.out.exists() and options.out.samefile(options.video):
-        raise RequestError(f"--out {options.out}: is the video itself; name another file")
+    if out.is_dir():
+        raise RequestError(f"--out {out}: is a folder; name a file")
+    if out.suffix.lower() != ".mp4":
+        raise RequestError(f"--out {out}: name an .mp4 file")
+    if video is not None and out.exists() and out.samefile(video):
+        raise RequestError(f"--out {out}: is the video itself; name another file")
 
 
-def load_forecasting(
+def load_forecaster(
     checkpoint: str, dataset: Path | None
-) -> tuple[str, Forecasting, SequenceSettings]:
+) -> tuple[str, LiveForecaster, SequenceSettings]:
     """Name, forecasts and sequence settings of a network or a baseline.
 
+    A baseline with parameters is fitted to every sequence of the dataset.
+
     Raises:
-        RequestError: it is neither, or cannot be used.
+        RequestError: it is neither, cannot be used, or needs a dataset.
     """
     if checkpoint in FORECASTERS:
-        return fit_baseline(checkpoint, dataset)
-    folder = Path(str(files("face_prediction"))) / "assets" / "residual"
-    if checkpoint != SHIPPED:
-        folder = Path(checkpoint)
+        settings = SequenceSettings()
+        known = LandmarkSequences(np.zeros((1, 1, NUM_LANDMARKS, 2), np.float32), ("nobody",))
+        if checkpoint not in UNFITTED:
+            if dataset is None:
+                raise RequestError(
+                    f"--checkpoint {checkpoint}: has parameters; name a --dataset to fit it to"
+                )
+            with FaceDataset(dataset) as opened:
+                settings = opened.manifest.settings
+                every = opened.indices().tolist()
+                known = LandmarkSequences(
+                    np.stack([opened.landmarks(i)[..., :2] for i in every]),
+                    tuple(opened.entry(i).subject for i in every),
+                )
+        predictor = BaselinePredictor(fit_forecaster(checkpoint, known))
+        return checkpoint, LandmarkForecaster(predictor, HORIZON), settings
+    folder = Path(checkpoint)
+    if checkpoint == SHIPPED:
+        folder = Path(str(files("face_prediction"))) / "assets" / "residual"
     if not folder.is_dir():
         what = "no network is in this package" if checkpoint == SHIPPED else "no such folder"
         raise RequestError(
@@ -183,32 +171,8 @@ def load_forecasting(
     # one frame is too little work to share: a second thread gains nothing on an idle machine, and
     # where the cores are busy its waiting costs several times the frame
     torch.set_num_threads(1)
-    predictor = LearnedPredictor.load(folder)
-    settings = SequenceSettings.from_json(predictor.record.dataset)
-    if predictor.needs.frames == 0:
-        return predictor.name, LandmarkForecasting(predictor, HORIZON), settings
-    return predictor.name, NetworkForecasting(predictor.model, predictor.name), settings
-
-
-def fit_baseline(name: str, dataset: Path | None) -> tuple[str, Forecasting, SequenceSettings]:
-    """A baseline, fitted to every sequence of a dataset where it has parameters.
-
-    Raises:
-        RequestError: it has parameters and there is no dataset.
-    """
-    settings = SequenceSettings()
-    if name in UNFITTED:
-        still = np.zeros((1, 1, NUM_LANDMARKS, 2), dtype=np.float32)
-        known = LandmarkSequences(still, ("nobody",))
-    elif dataset is None:
-        raise RequestError(f"--checkpoint {name}: has parameters; name a --dataset to fit it to")
-    else:
-        with FaceDataset(dataset) as opened:
-            settings = opened.manifest.settings
-            every = opened.indices().tolist()
-            known = LandmarkSequences(
-                np.stack([opened.landmarks(i)[..., :2] for i in every]),
-                tuple(opened.entry(i).subject for i in every),
-            )
-    predictor = BaselinePredictor(fit_forecaster(name, known))
-    return name, LandmarkForecasting(predictor, HORIZON), settings
+    network = LearnedPredictor.load(folder)
+    settings = SequenceSettings.from_json(network.record.dataset)
+    if network.needs.frames == 0:
+        return network.name, LandmarkForecaster(network, HORIZON), settings
+    return network.name, NetworkForecaster(network.model, network.name), settings

@@ -29,7 +29,7 @@ from face_prediction.dataset.manifest import MANIFEST_NAME, Manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import ClipFrames, clip_frames
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.evaluation.setup import batch_size, cross_fit
+from face_prediction.evaluation.predictors import batch_size, cross_fit
 from face_prediction.motion.library import (
     Attribution,
     MotionLibrary,
@@ -250,7 +250,9 @@ def run_predict(options: PredictOptions) -> int:
     lifted, withheld = lift_clips(track_files(options.tracks), rows, options.attribution, given)
     clips = [clip for clip in lifted if clip.motion.runs]
     folds = {clip.name: fold_of(clip, manifest) for clip in clips}
-    predictors = {clip.name: fits.of(folds[clip.name], clip.row.subject) for clip in clips}
+    predictors = {
+        clip.name: fits.predictor_for(folds[clip.name], clip.row.subject) for clip in clips
+    }
     library = library_of(lifted, withheld, given)
     sources = {
         name: video_for(clip, videos)

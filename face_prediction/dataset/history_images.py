@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from face_prediction.dataset.build import SAME_CLOCK
 from face_prediction.dataset.clip_file import decode_picture, encode_picture
+from face_prediction.dataset.image_batches import reduction
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.evaluation.batches import reduction
 from face_prediction.prediction.interface import PictureNeeds
 from face_prediction.prediction.predicted_motion import Origin
 from face_prediction.tracking.crop import Crop

@@ -1,30 +1,45 @@
-"""Matplotlib without a window: figures as PNG files, the same bytes for the same data."""
+"""Figures as PNG files, the same bytes for the same data.
+
+``errors.png`` and ``calibration.png`` are plots; ``forecast_KIND_ROW.png`` has images of faces.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.evaluation.calibration import LEVELS
-from face_prediction.evaluation.statistics import KindSummary
+from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.evaluation.errors import LEVELS
+from face_prediction.evaluation.scoring import EvaluationScores
+from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
+from face_prediction.evaluation.statistics import KindSummary, RowSummary
+from face_prediction.prediction.errors import mouth_distances
+from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.lifting import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 
-#: Colours that colour-blind readers can tell apart (Okabe and Ito), for networks.
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-#: Baselines are grey, and told apart by their marks.
+"""Colours of networks, which colour-blind readers can tell apart (Okabe and Ito)."""
 GREY = "#888888"
 MARKS = ("o", "s", "^", "D", "v", "x", "+", "*")
+"""Marks that tell the baselines apart, which are grey."""
+MOUTH_COLOUR, OTHER_COLOUR = "#00E000", "white"
+"""Colours of the mouth's landmarks, and of the others (paper, section IV.B)."""
+_LIVELIER_THAN = 0.9  # share of a kind that moves less than the sequence in the figures
+_PANEL = (4.2, 3.6)  # inches
+# inches from one image to the next, and to the left, above and on the other sides of all
+_STEP, _LEFT, _TOP, _EDGE = 2.3, 0.3, 0.65, 0.08
+_GAP = 0.03  # between two images, in images
 
 
-def new_figure(width: float, height: float, is_laid_out: bool = True) -> Any:
-    """An empty figure of this size in inches; its axes make room for their labels, or not.
+def new_matplotlib_figure(width: float, height: float, layout: str | None = "constrained") -> Any:
+    """An empty figure of this size in inches, without a window.
 
     Raises:
         RequestError: matplotlib is not installed.
@@ -37,24 +52,40 @@ def new_figure(width: float, height: float, is_laid_out: bool = True) -> Any:
             f"figures need matplotlib ({error}); pip install "
             "'robo_manip_baselines[face_prediction]', or give --no_figures"
         ) from None
-    figure = Figure(figsize=(width, height), dpi=100, layout="constrained" if is_laid_out else None)
+    figure = Figure(figsize=(width, height), dpi=100, layout=layout)  # pyright: ignore
     FigureCanvasAgg(figure)
     return figure
 
 
-def save_png(figure: Any, path: Path) -> None:
-    """Write ``figure`` to ``path``, whole or not at all.
+def write_figures(
+    folder: Path, setup: EvaluationSetup, scores: EvaluationScores, summaries: Sequence[KindSummary]
+) -> None:
+    """Write all figures.
 
     Raises:
-        RequestError: the folder cannot be written to.
+        RequestError: matplotlib is not installed, or the folder cannot be written to.
     """
-    with atomic_file(path) as temporary:
-        # without the name of the program: it would change with matplotlib's version
-        figure.savefig(temporary, format="png", metadata={"Software": None})
-
-
-#: Inches of one panel.
-_PANEL = (4.2, 3.6)
+    draw_errors(folder / "errors.png", summaries)
+    with_intervals = [s for s in summaries if any(row.has_intervals for row in s.rows)]
+    if with_intervals:
+        draw_calibration(folder / "calibration.png", with_intervals)
+    for summary in summaries:
+        place = _lively_sequence(scores, summary.kind)
+        index, row = int(setup.selection.indices[place]), setup.selection.rows[place]
+        for predictor in setup.predictors:
+            size = predictor.image_size
+            if not size:
+                continue
+            batch = SequenceBatch(setup.dataset, [index], ImagePlan.of(predictor.needs, [size]))
+            forecast = predictor.forecast([row], batch)
+            name = re.sub(r"\W+", "_", predictor.name).strip("_")
+            draw_forecast(
+                folder / f"forecast_{summary.kind}_{name}.png",
+                f"{predictor.name}, {summary.kind}: clip {row.clip}",
+                setup.dataset.manifest.settings.history + 1,
+                truth=Forecast(batch.future, batch.future_images(size)),
+                forecast=forecast,
+            )
 
 
 def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
@@ -62,119 +93,62 @@ def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
 
     Bands are 95 % intervals, of the networks and the best baseline.
     """
-    figure, panels = _panels(summaries, 1.0)
-    handles: dict[str, Any] = {}
-    for axes, summary in zip(panels, summaries, strict=True):
-        distance = summary.numbers["distance"]
-        ahead = np.arange(1, distance.value.shape[1] + 1)
-        style = row_styles(summary)
-        for i, name in enumerate(summary.rows):
-            (line,) = axes.plot(ahead, distance.value[i], **style[name])
-            handles.setdefault(name, line)
-            if summary.roles[i] == "network" or name == summary.best_baseline:
-                axes.fill_between(
-                    ahead,
-                    distance.low[i],
-                    distance.high[i],
-                    color=style[name]["color"],
-                    alpha=0.15,
-                    lw=0,
-                )
+    ahead = np.arange(1, summaries[0].horizon + 1)
+    figure, panels = _draw_curves(
+        summaries,
+        "distance",
+        ahead,
+        legend_room=1.0,
+        has_curve=lambda row: True,
+        has_band=lambda row, best: row.role == "network" or row.name == best,
+    )
+    for axes in panels:
         axes.set_xticks(ahead)
         axes.set_ylim(bottom=0)
         axes.set_xlabel("frames ahead (1/30 s)")
     panels[0].set_ylabel("mouth centre off by, crops")
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize="small")
-    save_png(figure, path)
+    _save_png(figure, path)
 
 
 def draw_calibration(path: Path, summaries: Sequence[KindSummary]) -> None:
     """Nominal against observed coverage of all forecast frames, a panel for each kind."""
-    figure, panels = _panels(summaries, 1.1)
-    handles: dict[str, Any] = {}
-    nominal = 100 * np.array(LEVELS)
-    for axes, summary in zip(panels, summaries, strict=True):
+    figure, panels = _draw_curves(
+        summaries,
+        "pooled_coverage",
+        100 * np.array(LEVELS),
+        legend_room=1.1,
+        has_curve=lambda row: row.has_intervals,
+        has_band=lambda row, best: True,
+        factor=100.0,
+    )
+    for axes in panels:
         axes.plot([0, 100], [0, 100], color="black", lw=0.8)
-        style = row_styles(summary)
-        coverage = summary.numbers["pooled_coverage"]
-        for i, name in enumerate(summary.rows):
-            if not summary.has_intervals[i]:
-                continue
-            value, low, high = (100 * v[i] for v in (coverage.value, coverage.low, coverage.high))
-            (handles[name],) = axes.plot(nominal, value, **style[name])
-            axes.fill_between(nominal, low, high, color=style[name]["color"], alpha=0.15, lw=0)
         axes.set_xlim(0, 100)
         axes.set_ylim(0, 100)
         axes.set_box_aspect(1)
         axes.set_xlabel("nominal coverage, %")
     panels[0].set_ylabel("observed coverage, %")
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize="small")
-    save_png(figure, path)
-
-
-def row_styles(summary: KindSummary) -> dict[str, dict[str, Any]]:
-    """How each row is drawn: networks in colour, baselines grey, the best of them black."""
-    result: dict[str, dict[str, Any]] = {}
-    networks = others = 0
-    for name, role in zip(summary.rows, summary.roles, strict=True):
-        if role == "network":
-            colour = COLOURS[networks % len(COLOURS)]
-            result[name] = {"color": colour, "lw": 2.2, "marker": "o", "ms": 4, "zorder": 3}
-            networks += 1
-        else:
-            colour = "black" if name == summary.best_baseline else GREY
-            mark = MARKS[others % len(MARKS)]
-            result[name] = {"color": colour, "lw": 1.2, "ls": "--", "marker": mark, "ms": 5}
-            others += 1
-    return result
-
-
-def _panels(summaries: Sequence[KindSummary], room: float) -> tuple[Any, Sequence[Any]]:
-    """A figure with a titled panel for each kind; ``room`` inches below for the legend."""
-    figure = new_figure(_PANEL[0] * len(summaries), _PANEL[1] + room)
-    panels = figure.subplots(1, len(summaries), squeeze=False)[0]
-    for axes, summary in zip(panels, summaries, strict=True):
-        people = "person" if summary.subjects == 1 else "people"
-        axes.set_title(
-            f"{summary.kind}: {summary.sequences} sequences, {summary.subjects} {people}",
-            fontsize="medium",
-        )
-        axes.grid(alpha=0.3)
-    return figure, panels
-
-
-#: Of the mouth's landmarks, and of the others (paper, section IV.B).
-MOUTH_COLOUR, OTHER_COLOUR = "#00E000", "white"
-#: Inches from one picture to the next, and to the left, above and on the other sides of all.
-_STEP, _LEFT, _TOP, _EDGE = 2.3, 0.3, 0.65, 0.08
-#: Room between two, in pictures.
-_GAP = 0.03
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Pictures (H, S, S, 3) and landmarks (H, L, 2), NaN where there are none."""
-
-    pictures: NDArray[np.uint8]
-    landmarks: NDArray[np.floating]
+    _save_png(figure, path)
 
 
 def draw_forecast(
-    path: Path, title: str, frames: Sequence[int], truth: Shown, forecast: Shown
+    path: Path, title: str, first_frame: int, truth: Forecast, forecast: Forecast
 ) -> None:
-    """A column for each frame; truth, truth with landmarks, forecast, forecast with landmarks."""
-    rows = (
-        ("truth", truth, False),
-        ("truth, landmarks", truth, True),
-        ("forecast", forecast, False),
-        ("forecast, landmarks", forecast, True),
-    )
+    """A column for each frame; truth, truth with landmarks, forecast, forecast with landmarks.
+
+    Args:
+        path: file to write.
+        title: above all.
+        first_frame: number of the first forecast frame.
+        truth: of one sequence, images included.
+        forecast: of the same.
+    """
+    count = truth.landmarks.shape[1]
     # squares of known size: a layout that looks for the best takes seconds for twenty of them
-    width = _LEFT + _STEP * len(frames) + _EDGE
-    height = _TOP + _STEP * len(rows) + _EDGE
-    figure = new_figure(width, height, is_laid_out=False)
+    width, height = _LEFT + _STEP * count + _EDGE, _TOP + _STEP * 4 + _EDGE
+    figure = new_matplotlib_figure(width, height, layout=None)
     figure.suptitle(title, y=1 - 0.1 / height, va="top")
-    grid = figure.subplots(len(rows), len(frames), squeeze=False)
+    grid = figure.subplots(4, count, squeeze=False)
     figure.subplots_adjust(
         left=_LEFT / width,
         bottom=_EDGE / height,
@@ -183,22 +157,72 @@ def draw_forecast(
         wspace=_GAP,
         hspace=_GAP,
     )
-    for line, (label, shown, with_landmarks) in zip(grid, rows, strict=True):
+    for number, line in enumerate(grid):
+        label, item = ("truth", truth) if number < 2 else ("forecast", forecast)
+        has_landmarks = number % 2 == 1
+        assert item.pictures is not None
         for column, axes in enumerate(line):
-            axes.imshow(shown.pictures[column], extent=(0, 1, 1, 0), interpolation="nearest")
+            axes.imshow(item.pictures[0, column], extent=(0, 1, 1, 0), interpolation="nearest")
             axes.set_xticks([])
             axes.set_yticks([])
-            if with_landmarks:
-                _dots(axes, shown.landmarks[column])
+            if has_landmarks:
+                _draw_landmarks(axes, item.landmarks[0, column])
             axes.set_xlim(0, 1)
             axes.set_ylim(1, 0)
-        line[0].set_ylabel(label)
-    for axes, frame in zip(grid[0], frames, strict=True):
+        line[0].set_ylabel(f"{label}, landmarks" if has_landmarks else label)
+    for frame, axes in enumerate(grid[0], start=first_frame):
         axes.set_title(f"frame {frame}")
-    save_png(figure, path)
+    _save_png(figure, path)
 
 
-def _dots(axes: Any, landmarks: NDArray[np.floating]) -> None:
+def _draw_curves(
+    summaries: Sequence[KindSummary],
+    key: str,
+    x: NDArray[np.number],
+    *,
+    legend_room: float,
+    has_curve: Callable[[RowSummary], bool],
+    has_band: Callable[[RowSummary, str], bool],
+    factor: float = 1.0,
+) -> tuple[Any, Sequence[Any]]:
+    """A figure with a panel for each kind: curves of the numbers ``key``, with their intervals.
+
+    Networks are in colour, baselines grey, the best of them black.
+    """
+    figure = new_matplotlib_figure(_PANEL[0] * len(summaries), _PANEL[1] + legend_room)
+    panels = figure.subplots(1, len(summaries), squeeze=False)[0]
+    handles: dict[str, Any] = {}
+    for axes, summary in zip(panels, summaries, strict=True):
+        people = "person" if summary.subjects == 1 else "people"
+        title = f"{summary.kind}: {summary.sequences} sequences, {summary.subjects} {people}"
+        axes.set_title(title, fontsize="medium")
+        axes.grid(alpha=0.3)
+        number = summary.numbers[key]
+        networks = others = 0
+        for i, row in enumerate(summary.rows):
+            if row.role == "network":
+                colour = COLOURS[networks % len(COLOURS)]
+                style = {"color": colour, "lw": 2.2, "marker": "o", "ms": 4, "zorder": 3}
+                networks += 1
+            else:
+                colour = "black" if row.name == summary.best_baseline else GREY
+                mark = MARKS[others % len(MARKS)]
+                style = {"color": colour, "lw": 1.2, "ls": "--", "marker": mark, "ms": 5}
+                others += 1
+            if not has_curve(row):
+                continue
+            value, low, high = (factor * v[i] for v in (number.value, number.low, number.high))
+            (line,) = axes.plot(x, value, **style)
+            handles.setdefault(row.name, line)
+            if has_band(row, summary.best_baseline):
+                axes.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
+    columns = min(4, 2 * len(summaries))  # more would be wider than one panel
+    place = {"loc": "outside lower center", "ncols": columns, "fontsize": "small"}
+    figure.legend(handles.values(), handles, **place)
+    return figure, panels
+
+
+def _draw_landmarks(axes: Any, landmarks: NDArray[np.floating]) -> None:
     if not np.isfinite(landmarks).all():
         axes.text(0.5, 0.5, "no face found", ha="center", va="center", color="white",
                   bbox={"facecolor": "black", "alpha": 0.6})  # fmt: skip
@@ -207,3 +231,16 @@ def _dots(axes: Any, landmarks: NDArray[np.floating]) -> None:
     is_mouth[list(LIPS)] = True
     for part, colour, size in ((~is_mouth, OTHER_COLOUR, 1.6), (is_mouth, MOUTH_COLOUR, 4.5)):
         axes.scatter(*landmarks[part].T, s=size, c=colour, linewidths=0)
+
+
+def _lively_sequence(scores: EvaluationScores, kind: str) -> int:
+    """Place of a sequence that moves more than most of its kind: in most little happens."""
+    places = scores.selection.of_kind(kind)
+    last = mouth_distances(scores.row(PERSISTENCE).residuals[places])[:, -1]
+    return int(places[np.argsort(last, kind="stable")[int(_LIVELIER_THAN * (len(last) - 1))]])
+
+
+def _save_png(figure: Any, path: Path) -> None:
+    with atomic_file(path) as temporary:
+        # without the name of the program: it would change with matplotlib's version
+        figure.savefig(temporary, format="png", metadata={"Software": None})

@@ -1,7 +1,6 @@
-"""Runs predictors over sequences and keeps what they are judged by.
+"""Scores of every predictor on every sequence, forecast batch by batch.
 
-Legend: N sequences, B of them at once, H horizon, L = 468 landmarks, S side of the pictures; the
-last axis of residuals holds U and V.
+Legend: N sequences, H horizon, S side of the images; the last axis of residuals holds U and V.
 """
 
 from __future__ import annotations
@@ -13,214 +12,171 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from face_prediction.dataset.reader import FaceDataset
-from face_prediction.evaluation.batches import Batch, PicturePlan, find_landmarks
-from face_prediction.evaluation.calibration import interval_levels
-from face_prediction.evaluation.errors import (
-    area_average,
-    mouth_residuals,
-    normalised_mean_errors,
-    similarities,
-)
-from face_prediction.evaluation.setup import Contestant, LineUp, Role, Selection
-from face_prediction.prediction.interface import Forecast, Predictor
-from face_prediction.tracking.tracks import NUM_LANDMARKS
-from robo_manip_baselines.runs.errors import RequestError
+from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.evaluation.errors import area_average, interval_levels, similarities
+from face_prediction.evaluation.predictors import Role, find_landmarks
+from face_prediction.evaluation.setup import EvaluationSetup, SequenceSelection
+from face_prediction.prediction.errors import mouth_residuals, normalised_mean_errors
+from face_prediction.prediction.interface import Forecast, PictureNeeds
 
 Floats = NDArray[np.float64]
 
-#: Sequences at once: of these, 70 pictures of 256 x 256 each are 110 MB.
 BATCH = 8
-#: What the detector finds in pictures that were not forecast: as well as pictures can do.
-TRUE_PICTURES = "detector on the true pictures"
+"""Sequences at once: of these, 70 images of 256 x 256 each are 110 MB."""
+TRUE_IMAGES = "detector on the true pictures"
+"""Row of the landmarks that the detector finds in true images: as well as images can do."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """How one row of the tables did; NaN where it has no such forecast."""
+class PredictorScores:
+    """Scores of one row of the tables; NaN where it has no such forecast.
+
+    Attributes:
+        name: of the row.
+        role: of the row.
+        image_size: side of the images that it makes; 0: none.
+        residuals: (N, H, 2) forecast minus truth of the mouth centre, in crops.
+        shuffled_residuals: (N, H, 2) with the images of other sequences.
+        levels: (N, H, 2) levels of `interval_levels`.
+        nme: (N, H) normalised mean error over all landmarks.
+        similarity: (N, H) SSIM at the side that all rows are compared at.
+        own_similarity: (N, H) SSIM at its own side, where that is larger.
+    """
 
     name: str
     role: Role
-    #: (N, H, 2) forecast minus truth of the mouth centre, in crops
+    image_size: int
     residuals: Floats
-    #: (N, H) normalised mean error over all landmarks
-    nme: Floats
-    #: (N, H) SSIM at the side that all rows are compared at
-    similarity: Floats
-    #: (N, H) SSIM at its own side, where that is larger
-    own_similarity: Floats
-    #: (N, H, 2) levels of `interval_levels`
+    shuffled_residuals: Floats
     levels: Floats
-    #: side of the pictures that it makes; 0: none
-    picture_size: int
+    nme: Floats
+    similarity: Floats
+    own_similarity: Floats
 
     @classmethod
-    def blank(cls, name: str, role: Role, picture_size: int, shape: tuple[int, int]) -> Judged:
-        """Nothing known yet of ``shape`` (N, H)."""
-        none = np.full(shape, np.nan)
-        pair = np.full((*shape, 2), np.nan)
-        return cls(name, role, pair, none, none.copy(), none.copy(), pair.copy(), picture_size)
+    def empty(
+        cls, name: str, role: Role, image_size: int, shape: tuple[int, int]
+    ) -> PredictorScores:
+        """NaN for ``shape`` (N, H)."""
+        pairs = [np.full((*shape, 2), np.nan) for _ in range(3)]
+        return cls(name, role, image_size, *pairs, *(np.full(shape, np.nan) for _ in range(3)))
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """All rows on the same N sequences."""
+class EvaluationScores:
+    """Scores of all rows on the same N sequences.
 
-    selection: Selection
-    rows: tuple[Judged, ...]
-    #: side of the pictures at which all rows are compared
+    Attributes:
+        selection: the sequences.
+        rows: one for each predictor, and for a detector on the true images.
+        common_size: side of the images at which all rows are compared.
+        copies: for each larger side that images were made at, SSIM (N, H) of copies of the last
+            one.
+    """
+
+    selection: SequenceSelection
+    rows: tuple[PredictorScores, ...]
     common_size: int
-    #: for each larger side that pictures were made at, SSIM (N, H) of copies of the last one
     copies: Mapping[int, Floats]
 
-    def row(self, name: str) -> Judged:
+    def row(self, name: str) -> PredictorScores:
         """The row of that name."""
         return next(row for row in self.rows if row.name == name)
 
 
-def judge(dataset: FaceDataset, selection: Selection, line_up: LineUp, bar: tqdm) -> Verdict:
-    """Forecast every sequence by every contestant, and compare with what came.
+def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> EvaluationScores:
+    """Forecast every sequence by every predictor, and compare with the truth.
 
     Args:
-        dataset: where the sequences are.
-        selection: N of them.
-        line_up: the contestants.
-        bar: advanced by one for each sequence and contestant.
+        setup: sequences and predictors.
+        progress: show a progress bar.
 
     Raises:
         RequestError: a forecast is not as it should be, or the dataset is damaged.
     """
-    settings = dataset.manifest.settings
-    shape = (len(selection), settings.future)
-    rows = {
-        contestant.name: Judged.blank(
-            contestant.name, contestant.role, line_up.picture_sizes[contestant.name], shape
-        )
-        for contestant in line_up.contestants
-    }
-    sizes = line_up.sizes
-    if line_up.detector is not None:
-        rows[TRUE_PICTURES] = Judged.blank(TRUE_PICTURES, "reference", 0, shape)
-    copies = {size: np.full(shape, np.nan) for size in sizes if size > line_up.common_size}
-    plan = PicturePlan.of(line_up.needs(), sizes)
-    for places in batches(selection):
-        batch = Batch(dataset, selection.indices[places].tolist(), plan)
-        for contestant in line_up.contestants:
-            predictor = _predictor_of(contestant, selection, places)
-            forecast = forecast_of(predictor, batch.history, batch.shown(predictor.needs), shape[1])
-            _score(rows[contestant.name], places, forecast, batch, line_up.common_size)
-            bar.update(len(places))
-        for size, copied in copies.items():
-            last = np.repeat(batch.last(size), shape[1], axis=1)
-            copied[places] = similarities(last, batch.coming(size))
-        if line_up.detector is not None:
-            found = find_landmarks(batch.coming(line_up.detected_size), line_up.detector)
-            _score_landmarks(rows[TRUE_PICTURES], places, found, batch.future)
-            bar.update(len(places))
-    return Verdict(selection, tuple(rows.values()), line_up.common_size, copies)
+    dataset, selection = setup.dataset, setup.selection
+    shape = (len(selection), dataset.manifest.settings.future)
+    rows = [PredictorScores.empty(p.name, p.role, p.image_size, shape) for p in setup.predictors]
+    true_images = PredictorScores.empty(TRUE_IMAGES, "reference", 0, shape)
+    last_images = {size: PictureNeeds(1, size) for size in setup.sizes}
+    copies = {size: np.full(shape, np.nan) for size in setup.sizes if size > setup.common_size}
+    needs = [needs for predictor in setup.predictors for needs in predictor.needs]
+    plan = ImagePlan.of([*needs, *last_images.values()], setup.sizes)
+    with _progress_bar(len(selection) * len(rows), progress) as bar:
+        for places in selection.batches(BATCH):
+            batch = SequenceBatch(dataset, selection.indices[places].tolist(), plan)
+            for predictor, row in zip(setup.predictors, rows, strict=True):
+                forecast = predictor.forecast(selection.rows_at(places), batch)
+                _score(row, places, forecast, batch, setup.common_size)
+                bar.update(len(places))
+            for size, copied in copies.items():
+                last = batch.images(last_images[size])
+                assert last is not None
+                copied[places] = similarities(
+                    np.repeat(last, shape[1], axis=1), batch.future_images(size)
+                )
+            if setup.detector is not None:
+                images = batch.future_images(setup.detected_size)
+                found = Forecast(find_landmarks(images, setup.detector))
+                _score(true_images, places, found, batch, setup.common_size)
+    if setup.detector is not None:
+        rows.append(true_images)
+    return EvaluationScores(selection, tuple(rows), setup.common_size, copies)
 
 
-def judge_exchanged(
-    dataset: FaceDataset,
-    selection: Selection,
-    line_up: LineUp,
-    partner: NDArray[np.int64],
-    bar: tqdm,
-) -> dict[str, Floats]:
-    """Mouth residuals (N, H, 2) of every network that looks at pictures, shown others' pictures.
+def score_shuffled_images(
+    setup: EvaluationSetup,
+    scores: EvaluationScores,
+    partners: NDArray[np.integer],
+    progress: bool = False,
+) -> None:
+    """Fill in ``shuffled_residuals`` of every network that looks at images.
 
-    Landmarks stay a sequence's own.
+    Landmarks stay a sequence's own; images are those of its partner.
 
     Args:
-        dataset: where the sequences are.
-        selection: N of them.
-        line_up: the contestants.
-        partner: (N,) places in ``selection`` of those whose pictures are shown.
-        bar: advanced by one for each sequence and network.
+        setup: sequences and predictors.
+        scores: to be filled in.
+        partners: (N,) places of the sequences whose images stand in.
+        progress: show a progress bar.
     """
-    horizon = dataset.manifest.settings.future
-    lookers = line_up.lookers
-    residuals = {c.name: np.full((len(selection), horizon, 2), np.nan) for c in lookers}
-    plan = PicturePlan.of((f.predictor.needs for c in lookers for f in c.fit.by_fold.values()), ())
-    for places in batches(selection):
-        shown = selection.indices[partner[places]].tolist()
-        batch = Batch(dataset, selection.indices[places].tolist(), plan, shown)
-        for contestant in lookers:
-            predictor = _predictor_of(contestant, selection, places)
-            forecast = forecast_of(predictor, batch.history, batch.shown(predictor.needs), horizon)
-            residuals[contestant.name][places] = mouth_residuals(forecast.landmarks, batch.future)
-            bar.update(len(places))
-    return residuals
+    indices, networks = setup.selection.indices, setup.image_networks
+    plan = ImagePlan.of(needs for network in networks for needs in network.needs)
+    with _progress_bar(len(indices) * len(networks), progress) as bar:
+        for places in setup.selection.batches(BATCH):
+            images_of = indices[partners[places]].tolist()
+            batch = SequenceBatch(setup.dataset, indices[places].tolist(), plan, images_of)
+            for network in networks:
+                forecast = network.forecast(setup.selection.rows_at(places), batch)
+                scores.row(network.name).shuffled_residuals[places] = mouth_residuals(
+                    forecast.landmarks, batch.future
+                )
+                bar.update(len(places))
 
 
-def steps(selection: Selection, line_up: LineUp, is_exchanged: bool) -> int:
-    """How often the bar will be advanced."""
-    rows = len(line_up.contestants) + (line_up.detector is not None)
-    return len(selection) * (rows + (len(line_up.lookers) if is_exchanged else 0))
-
-
-def batches(selection: Selection) -> list[NDArray[np.intp]]:
-    """Places of sequences to forecast at once: `BATCH` or fewer of one fold."""
-    result: list[NDArray[np.intp]] = []
-    for fold in np.unique(selection.folds):
-        places = np.flatnonzero(selection.folds == fold)
-        result += [places[i : i + BATCH] for i in range(0, len(places), BATCH)]
-    return result
-
-
-def forecast_of(
-    predictor: Predictor,
-    history: NDArray[np.float32],
-    pictures: NDArray[np.uint8] | None,
-    horizon: int,
-) -> Forecast:
-    """A forecast whose landmarks are of the shape that was asked for.
-
-    Raises:
-        RequestError: they are not.
-    """
-    forecast = predictor.predict(history, pictures, horizon)
-    expected = (len(history), horizon, NUM_LANDMARKS, 2)
-    if forecast.landmarks.shape != expected:
-        raise RequestError(
-            f"{predictor.name}: landmarks of shape {forecast.landmarks.shape}; expected {expected}"
-        )
-    return forecast
-
-
-def _predictor_of(
-    contestant: Contestant, selection: Selection, places: NDArray[np.intp]
-) -> Predictor:
-    """The one for these sequences, all of one fold; none of their people shaped it."""
-    fold = int(selection.folds[places[0]])
-    checked = [contestant.fit.of(fold, selection.subjects[place]) for place in places.tolist()]
-    return checked[0]
+def _progress_bar(total: int, shown: bool) -> tqdm:
+    return tqdm(total=total, unit="forecast", leave=False, disable=not shown)
 
 
 def _score(
-    row: Judged, places: NDArray[np.intp], forecast: Forecast, batch: Batch, common: int
+    row: PredictorScores,
+    places: NDArray[np.intp],
+    forecast: Forecast,
+    batch: SequenceBatch,
+    common_size: int,
 ) -> None:
-    _score_landmarks(row, places, forecast.landmarks, batch.future)
+    row.residuals[places] = mouth_residuals(forecast.landmarks, batch.future)
+    row.nme[places] = normalised_mean_errors(forecast.landmarks, batch.future)
     if forecast.mouth_scale is not None:
         degrees = forecast.degrees_of_freedom
         if degrees is None:
             degrees = np.full(forecast.mouth_scale.shape[1:], np.inf)
         row.levels[places] = interval_levels(row.residuals[places], forecast.mouth_scale, degrees)
     if forecast.pictures is not None:
-        truth = batch.coming(row.picture_size)
+        truth = batch.future_images(row.image_size)
         # the truth is brought to the common side by the same way, so that no row gains by it
         row.similarity[places] = similarities(
-            area_average(forecast.pictures, common), area_average(truth, common)
+            area_average(forecast.pictures, common_size), area_average(truth, common_size)
         )
-        if row.picture_size > common:
+        if row.image_size > common_size:
             row.own_similarity[places] = similarities(forecast.pictures, truth)
-
-
-def _score_landmarks(
-    row: Judged,
-    places: NDArray[np.intp],
-    landmarks: NDArray[np.float32],
-    truth: NDArray[np.float32],
-) -> None:
-    row.residuals[places] = mouth_residuals(landmarks, truth)
-    row.nme[places] = normalised_mean_errors(landmarks, truth)

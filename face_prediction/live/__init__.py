@@ -1,1 +1,1 @@
-"""Forecasting while the camera runs."""
+"""Forecasts while a camera runs."""

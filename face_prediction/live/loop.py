@@ -1,4 +1,4 @@
-"""Detector, predictor and picture in turn, with their times."""
+"""The live loop: detector, predictor and display in turn, with their times."""
 
 from __future__ import annotations
 
@@ -7,31 +7,34 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from face_prediction.live.sinks import GREEN, NEAR, WHITE, Colour, Sink, draw_lines, draw_mouth
+from face_prediction.live.display import GREEN, NEAR, WHITE, Colour, Show, draw_mouth, draw_text
+from face_prediction.live.sources import FindFace
 from face_prediction.live.streaming import LiveForecast, StreamingPredictor
 from face_prediction.tracking.video import VideoFrame
 
-#: Frames that the rates on the screen are averaged over.
 RECENT = 30
+"""Frames that the rates on the screen are averaged over."""
 STAGES = ("detector", "predictor", "whole")
-
-Find = Callable[[NDArray[np.uint8], float], NDArray[np.floating] | None]
 
 
 @dataclass
-class Times:
-    """Seconds that each stage took, frame by frame; the predictor's only with a face."""
+class LiveStatistics:
+    """Times and counts of a run so far; kept up to date, so that an interrupted one has them too.
+
+    Attributes:
+        seconds: of each stage, frame by frame; the predictor's only with a face.
+        frames: number of them.
+        faces: frames with a face.
+        crops: crops that were laid.
+    """
 
     seconds: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
+    frames: int = 0
+    faces: int = 0
+    crops: int = 0
 
-    def recent(self, stage: str) -> float:
-        """Mean of the last `RECENT` frames in seconds; NaN: none yet."""
-        last = self.seconds[stage][-RECENT:]
-        return float(np.mean(last)) if last else float("nan")
-
-    def table(self) -> str:
+    def times_table(self) -> str:
         """Mean and 95 % quantile of every stage, as Markdown."""
         lines = ["| | frames | mean ms | 95 % ms | a second |", "|---|---|---|---|---|"]
         for stage, seconds in self.seconds.items():
@@ -43,25 +46,14 @@ class Times:
         return "\n".join(lines)
 
 
-@dataclass
-class Summary:
-    """What has come of a run so far; kept up to date, so that an interrupted one has it too."""
-
-    times: Times = field(default_factory=Times)
-    frames: int = 0
-    #: frames with a face, and crops that were laid
-    faces: int = 0
-    crops: int = 0
-
-
 def run_loop(
     frames: Iterable[VideoFrame],
-    find: Find,
+    find: FindFace,
     predictor: StreamingPredictor,
-    sink: Sink,
+    show: Show,
     name: str,
     history: int,
-    summary: Summary,
+    statistics: LiveStatistics,
     clock: Callable[[], float] = time.perf_counter,
 ) -> None:
     """Find, forecast, draw and show, until there are no more frames or the user has seen enough.
@@ -70,10 +62,10 @@ def run_loop(
         frames: images with their times.
         find: the detector.
         predictor: in its first state.
-        sink: takes what is drawn.
+        show: takes the drawn images.
         name: of the predictor, for the screen.
         history: frames of a whole history.
-        summary: is filled.
+        statistics: is filled.
         clock: seconds.
     """
     last: float | None = None
@@ -83,34 +75,32 @@ def run_loop(
         found = clock()
         forecast = predictor.update(frame.time, landmarks, frame.image)
         done = clock()
-        seconds = summary.times.seconds
-        seconds["detector"].append(found - begun)
-        summary.frames += 1
-        if forecast is not None:
-            seconds["predictor"].append(done - found)
-            summary.faces += 1
-            summary.crops += forecast.is_new_crop
+        statistics.seconds["detector"].append(found - begun)
+        statistics.frames += 1
         image = frame.image.copy()
         if landmarks is not None and forecast is not None:
+            statistics.seconds["predictor"].append(done - found)
+            statistics.faces += 1
+            statistics.crops += forecast.is_new_crop
             draw_mouth(image, landmarks, forecast.landmarks)
-        draw_lines(image, captions(summary.times, forecast, name, history))
-        goes_on = sink.show(image, frame.time)
+        draw_text(image, captions(statistics, forecast, name, history))
+        goes_on = show(image, frame.time)
         ended = clock()
-        # from image to image: what waiting for the camera takes is part of it
-        seconds["whole"].append(ended - (begun if last is None else last))
+        # from image to image, the wait for the camera included
+        statistics.seconds["whole"].append(ended - (begun if last is None else last))
         last = ended
         if not goes_on:
             return
 
 
 def captions(
-    times: Times, forecast: LiveForecast | None, name: str, history: int
+    statistics: LiveStatistics, forecast: LiveForecast | None, name: str, history: int
 ) -> list[tuple[str, Colour]]:
     """The lines on the screen."""
     lines: list[tuple[str, Colour]] = []
-    for stage in STAGES:
-        mean = times.recent(stage)
-        if np.isfinite(mean) and mean > 0:
+    for stage, seconds in statistics.seconds.items():
+        mean = float(np.mean(seconds[-RECENT:])) if seconds else 0.0
+        if mean > 0:
             lines.append((f"{stage} {1e3 * mean:.1f} ms, {1 / mean:.0f} a second", WHITE))
     if forecast is None:
         lines.append(("face lost", NEAR))

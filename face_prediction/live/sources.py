@@ -1,11 +1,12 @@
-"""Where live images come from: a video file, frame by frame, or a camera, always its newest."""
+"""Live images and faces: a video file, frame by frame, or a camera, always its newest image."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,12 +19,14 @@ from face_prediction.tracking.geometry import read_canonical_face
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 
-#: Seconds that a camera may take to give an image before it counts as gone.
 CAMERA_TIMEOUT = 5.0
+"""Seconds that a camera may take to give an image before it counts as gone."""
+
+FindFace = Callable[[NDArray[np.uint8], float], NDArray[np.floating] | None]
 
 
 class Capture(Protocol):
-    """What of OpenCV's VideoCapture is used."""
+    """Interface of OpenCV's VideoCapture that is used here."""
 
     def read(self) -> tuple[bool, Any]:
         """The next image (rows, columns, 3) uint8 BGR."""
@@ -34,12 +37,27 @@ class Capture(Protocol):
         ...
 
 
-def video_frames(path: Path) -> Generator[VideoFrame, None, None]:
-    """Every frame of a video file.
+def live_frames(
+    video: Path | None, camera: int | None, seconds: float | None = None
+) -> Generator[VideoFrame, None, None]:
+    """Frames of a video file or of camera ``camera``, ``seconds`` of them at most.
 
     Raises:
-        RequestError: it cannot be read to its end.
+        RequestError: it cannot be opened, or not read to its end.
     """
+    frames = _file_frames(video) if video else camera_frames(open_camera(camera or 0))
+    first: float | None = None
+    try:
+        for frame in frames:
+            first = frame.time if first is None else first
+            if seconds is not None and frame.time - first >= seconds:
+                return
+            yield frame
+    finally:
+        frames.close()
+
+
+def _file_frames(path: Path) -> Generator[VideoFrame, None, None]:
     with VideoReader(path) as video:
         yield from video.frames()
 
@@ -108,8 +126,12 @@ def camera_frames(
         capture.release()
 
 
-class FaceFinder:
-    """Finds the same face in successive images. Use as a context manager.
+@contextmanager
+def face_finder(model: Path) -> Iterator[FindFace]:
+    """A detector that follows one face through successive images.
+
+    Yields a function of an image (rows, columns, 3) uint8 RGB and its time in s, later than the
+    one before, that returns landmarks (468, 3), normalised image coordinates, or None.
 
     Args:
         model: MediaPipe's face_landmarker.task.
@@ -117,26 +139,13 @@ class FaceFinder:
     Raises:
         RequestError: MediaPipe is not installed, or the model cannot be loaded.
     """
+    with FaceDetector(model, DetectorSettings()) as detector:
+        zooming = ZoomingDetector(detector.detect, read_canonical_face(model))
+        follower = FaceFollower()
 
-    def __init__(self, model: Path) -> None:
-        self._detector = FaceDetector(model, DetectorSettings())
-        self._zooming = ZoomingDetector(self._detector.detect, read_canonical_face(model))
-        self._follower = FaceFollower()
+        def find(image: NDArray[np.uint8], time: float) -> NDArray[np.floating] | None:
+            size = (image.shape[1], image.shape[0])
+            face = follower.choose(zooming.detect(image, time), time, size)
+            return None if face is None else zooming.refine(face, image, time).landmarks
 
-    def __enter__(self) -> FaceFinder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._detector.close()
-
-    def find(self, image: NDArray[np.uint8], time: float) -> NDArray[np.float64] | None:
-        """Landmarks (468, 3), normalised image coordinates, or None.
-
-        Args:
-            image: (rows, columns, 3) uint8 RGB.
-            time: s, later than the one before.
-        """
-        size = (image.shape[1], image.shape[0])
-        faces = self._zooming.detect(image, time)
-        face = self._follower.choose(faces, time, size)
-        return None if face is None else self._zooming.refine(face, image, time).landmarks
+        yield find

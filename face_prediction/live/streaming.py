@@ -1,17 +1,18 @@
-"""The landmarks seen so far at the predictor's rate, whatever the camera's is.
+"""Forecasts from every new frame, whatever the camera's rate.
 
 Everything is counted back from the newest frame, so that nothing waits for a later one: the
-history is what was seen 0, 1, 2, ... thirtieths of a second before it, between two frames on the
+history is the landmarks 0, 1, 2, ... thirtieths of a second before it, between two frames on the
 straight line, and before the first frame at rest.
 
-Legend: N frames seen, T frames of history, L = 468 landmarks.
+Legend: N frames with the face, T frames of history, H horizon, L = 468 landmarks, P images at the
+end of the history, S their side, K neighbouring images that the features of one frame come from.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 
     from face_prediction.models.interface import PredictorModel
 
+SIZE_CHANGE = 1.25
+"""A new crop is laid when the side of the old one is this many times what it would be now, or one
+such part of it."""
+
 
 def times_back(now: float, count: int, fps: float) -> NDArray[np.float64]:
     """The last ``count`` times (T,) of a history that ends at ``now``, the newest last."""
@@ -37,9 +42,7 @@ def times_back(now: float, count: int, fps: float) -> NDArray[np.float64]:
 
 
 def landmarks_at(
-    wanted: NDArray[np.float64],
-    times: NDArray[np.float64],
-    landmarks: NDArray[np.floating],
+    wanted: NDArray[np.float64], times: NDArray[np.float64], landmarks: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Landmarks (T, L, C) at ``wanted`` (T,), none later than the last of ``times``.
 
@@ -69,90 +72,119 @@ def nearest(wanted: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[
     return np.where(is_later, after, before)
 
 
-#: A crop is laid anew when its side is this many times, or one such part of, what it would be.
-SIZE_CHANGE = 1.25
-
-
-class Forecasting(Protocol):
-    """What makes forecasts of a history, and features of its pictures, each picture once."""
-
-    @property
-    def needs(self) -> PictureNeeds:
-        """Which pictures it looks at."""
-        ...
-
-    @property
-    def span(self) -> int:
-        """K."""
-        ...
-
-    def features(self, landmarks: NDArray[np.float32], pictures: NDArray[np.uint8]) -> Any:
-        """Features of one frame, from landmarks (K, L, 2) and pictures (K, S, S, 3) up to it."""
-        ...
-
-    def forecast(
-        self,
-        landmarks: NDArray[np.float32],
-        features: list[Any],
-        last_picture: NDArray[np.uint8] | None,
-    ) -> NDArray[np.float32]:
-        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features."""
-        ...
-
-
 @dataclass(frozen=True)
-class LandmarkForecasting:
-    """A predictor that looks at no pictures."""
+class LandmarkForecaster:
+    """Forecasts of a predictor that looks at no images."""
 
     predictor: Predictor
     horizon: int
-    span: int = 1
+    needs = PictureNeeds(frames=0, size=0)
 
-    @property
-    def needs(self) -> PictureNeeds:
-        """None."""
-        return PictureNeeds(frames=0, size=0)
-
-    def features(self, landmarks: NDArray[np.float32], pictures: NDArray[np.uint8]) -> Any:
-        """There are none."""
-        raise NotImplementedError
-
-    def forecast(
-        self,
-        landmarks: NDArray[np.float32],
-        features: list[Any],
-        last_picture: NDArray[np.uint8] | None,
-    ) -> NDArray[np.float32]:
+    def forecast(self, landmarks: NDArray[np.float32]) -> NDArray[np.float32]:
         """Landmarks (H, L, 2) after those (T, L, 2)."""
         return self.predictor.predict(landmarks[None], None, self.horizon).landmarks[0]
 
 
-@dataclass
-class _Seen:
-    """One frame with the face; picture and features at the present crop, once they were needed.
+class NetworkForecaster:
+    """Features and forecasts of one network, in eval mode; each image is encoded once.
 
-    The image is None where nobody looks at it, or not any more.
+    Args:
+        network: on its device.
+        name: in messages.
+
+    Attributes:
+        needs: images that it looks at.
+        span: K.
+
+    Raises:
+        RequestError: the network forecasts no landmarks.
+    """
+
+    def __init__(self, network: PredictorModel, name: str) -> None:
+        self._network, self._name = network.eval(), name
+        self._device = next(network.parameters()).device
+        self.needs, self.span = network.needs, network.span
+        # a first run, which takes longer than others, before a camera waits for it
+        still = np.zeros((network.history, NUM_LANDMARKS, 2), dtype=np.float32)
+        black = np.zeros((self.span, self.needs.size, self.needs.size, 3), dtype=np.uint8)
+        features = self.features(still[: self.span], black)
+        self.forecast(still, [features] * (self.needs.frames - self.span + 1), black[-1])
+
+    def features(self, landmarks: NDArray[np.float32], images: NDArray[np.uint8]) -> torch.Tensor:
+        """Features (1, 1, ...) of one frame, from landmarks (K, L, 2) and images (K, S, S, 3)."""
+        import torch
+
+        with torch.inference_mode():
+            return self._network.encode(self._tensor(landmarks), self._tensor(images))
+
+    def forecast(
+        self,
+        landmarks: NDArray[np.float32],
+        features: list[torch.Tensor],
+        last_image: NDArray[np.uint8],
+    ) -> NDArray[np.float32]:
+        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features.
+
+        Raises:
+            RequestError: the network forecasts no landmarks.
+        """
+        import torch
+
+        with torch.inference_mode():
+            ahead = self._network.decode(
+                self._tensor(landmarks[-self._network.history :]),
+                torch.cat(features, dim=1),
+                self._tensor(last_image),
+                make_pictures=False,
+            ).landmarks
+        if ahead is None:
+            raise RequestError(
+                f"{self._name}: forecasts images and no landmarks; use another network"
+            )
+        return ahead[0].float().cpu().numpy()
+
+    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
+        """A batch of one, on the network's device."""
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(values))[None].to(self._device)
+
+
+@dataclass
+class _Frame:
+    """One frame with the face.
+
+    Attributes:
+        time: s.
+        landmarks: (L, 3) normalised image coordinates.
+        box: (2, 2) least and largest x, y of them.
+        image: None where nobody looks at it, or not any more.
+        cut: (S, S, 3) of it at the present crop, once it was needed.
+        features: of the network at the present crop, once they were needed.
     """
 
     time: float
-    landmarks: NDArray[np.floating]  # (L, 3) normalised image coordinates
-    box: NDArray[np.floating]  # (2, 2) least and largest x, y of them
+    landmarks: NDArray[np.floating]
+    box: NDArray[np.floating]
     image: NDArray[np.uint8] | None
-    picture: NDArray[np.uint8] | None = None
+    cut: NDArray[np.uint8] | None = None
     features: Any = None
 
 
 @dataclass(frozen=True)
 class LiveForecast:
-    """What is forecast from the newest frame."""
+    """Forecast from the newest frame.
 
-    #: (H, L, 2) normalised image coordinates
+    Attributes:
+        landmarks: (H, L, 2) normalised image coordinates.
+        crop: the part of the image that the predictor sees.
+        is_new_crop: the crop was laid with this frame.
+        known: frames of the history that were seen, T when it is whole.
+    """
+
     landmarks: NDArray[np.float64]
-    #: what the predictor sees of the image
     crop: Crop
-    #: the crop was laid anew with this frame
     is_new_crop: bool
-    #: frames of the history that were seen, T when it is whole
     known: int
 
 
@@ -160,33 +192,35 @@ class StreamingPredictor:
     """Forecasts from every frame, as the predictor would from the whole history.
 
     The crop is laid around the faces of the history and then stands still: while it does, the
-    features of past frames stay true, and a new frame costs one encoding. It is laid anew when the
-    face leaves it, or when its size has become wrong (`SIZE_CHANGE`); pictures and features of the
-    frames that still count are then made again, at once.
+    features of past frames stay true, and a new frame costs one encoding. Another one is laid when
+    the face leaves it, or when its size has become wrong (`SIZE_CHANGE`); images are then cut out
+    and encoded again, of all frames that still count.
 
     A face that is gone for more than `MAX_GAP` seconds is forgotten, with its history. Between
     frames further apart than that nothing is known either.
 
     Args:
-        forecasting: what makes the forecasts.
-        settings: of the sequences that it was trained on: history, rate, margin, pictures.
+        forecaster: makes the forecasts.
+        settings: of the sequences that it was trained on: history, rate, margin, images.
     """
 
-    def __init__(self, forecasting: Forecasting, settings: SequenceSettings) -> None:
-        self._forecasting = forecasting
+    def __init__(
+        self, forecaster: LandmarkForecaster | NetworkForecaster, settings: SequenceSettings
+    ) -> None:
+        self._forecaster = forecaster
         self._settings = settings
-        self._seen: deque[_Seen] = deque()
+        self._frames: deque[_Frame] = deque()
         self._crop: Crop | None = None
 
     def reset(self) -> None:
         """Forget everything."""
-        self._seen.clear()
+        self._frames.clear()
         self._crop = None
 
     def update(
         self, time: float, landmarks: NDArray[np.floating] | None, image: NDArray[np.uint8]
     ) -> LiveForecast | None:
-        """Take one frame in, and forecast what comes after it; None: there is no face.
+        """Take one frame in, and forecast the next ones; None: there is no face.
 
         Args:
             time: s, later than that of the frame before.
@@ -196,171 +230,80 @@ class StreamingPredictor:
         Raises:
             ValueError: the time is not later.
         """
-        if self._seen and time <= self._seen[-1].time:
-            raise ValueError(f"a frame at {time} s after one at {self._seen[-1].time} s")
-        if self._seen and time - self._seen[-1].time > MAX_GAP + SAME_TIME:
+        frames = self._frames
+        if frames and time <= frames[-1].time:
+            raise ValueError(f"a frame at {time} s after one at {frames[-1].time} s")
+        if frames and time - frames[-1].time > MAX_GAP + SAME_TIME:
             self.reset()
         if landmarks is None:
             return None
-        needs = self._forecasting.needs
-        across = landmarks[:, :2]
-        box = np.stack([across.min(axis=0), across.max(axis=0)])
-        self._seen.append(_Seen(time, landmarks, box, image if needs.frames else None))
+        needs = self._forecaster.needs
+        box = np.stack([landmarks[:, :2].min(axis=0), landmarks[:, :2].max(axis=0)])
+        frames.append(_Frame(time, landmarks, box, image if needs.frames else None))
         wanted = times_back(time, self._settings.history, self._settings.fps)
-        self._drop_before(float(wanted[0]))
-        times = np.array([frame.time for frame in self._seen])
-        points = np.stack([frame.landmarks for frame in self._seen])
-        history = landmarks_at(wanted, times, points)
+        while len(frames) > 1 and frames[1].time < wanted[0] - SAME_TIME:
+            frames.popleft()  # no time of the history lies next to it any more
+        times = np.array([frame.time for frame in frames])
+        points = np.stack([frame.landmarks for frame in frames])
         size = (image.shape[1], image.shape[0])
-        is_new = self._lay_crop(float(wanted[0]), size)
-        assert self._crop is not None
-        shown = self._crop.normalise(history, size)[..., :2].astype(np.float32)
-        features: list[Any] = []
-        picture = None
-        if needs.frames:
-            features = self._features(wanted[-needs.frames :], times, points, size)
-            picture = self._picture(len(self._seen) - 1)
-            self._drop_images_before(float(wanted[-needs.frames]) - MAX_GAP)
-        ahead = self._forecasting.forecast(shown, features, picture)
+        crop, is_new = self._lay_crop(float(wanted[0]), size)
+        history = crop.normalise(landmarks_at(wanted, times, points), size)
+        history = history[..., :2].astype(np.float32)
+        if isinstance(self._forecaster, LandmarkForecaster):
+            ahead = self._forecaster.forecast(history)
+        else:
+            features = self._features(self._forecaster, crop, wanted, times, points, size)
+            ahead = self._forecaster.forecast(history, features, self._cut(frames[-1], crop))
+            for frame in frames:  # too old to be looked at again, whatever the crop will be
+                if frame.time < wanted[-needs.frames] - MAX_GAP - SAME_TIME:
+                    frame.image = frame.cut = None
         return LiveForecast(
-            landmarks=image_points(self._crop, ahead, size),
-            crop=self._crop,
+            landmarks=image_points(crop, ahead, size),
+            crop=crop,
             is_new_crop=is_new,
             known=int(np.sum(wanted >= times[0] - SAME_TIME)),
         )
 
-    def _drop_before(self, oldest: float) -> None:
-        """Drop frames that no time from ``oldest`` on lies next to."""
-        while len(self._seen) > 1 and self._seen[1].time < oldest - SAME_TIME:
-            self._seen.popleft()
-
-    def _drop_images_before(self, oldest: float) -> None:
-        """Drop images that are too old to be looked at again, whatever the crop will be."""
-        for frame in self._seen:
-            if frame.time >= oldest - SAME_TIME:
-                return
-            frame.image = frame.picture = None
-
-    def _lay_crop(self, oldest: float, size: tuple[int, int]) -> bool:
-        """Keep the crop or lay one around the faces since ``oldest``; whether it is new."""
-        boxes = [frame.box for frame in self._seen if frame.time > oldest - SAME_TIME]
+    def _lay_crop(self, oldest: float, size: tuple[int, int]) -> tuple[Crop, bool]:
+        """The old crop, or one around the faces since ``oldest``; whether it is new."""
+        boxes = [frame.box for frame in self._frames if frame.time > oldest - SAME_TIME]
         fresh = crop_around(np.stack(boxes), size, self._settings.margin)
         if self._crop is not None:
-            corners = np.pad(boxes[-1], ((0, 0), (0, 1)))  # a depth, of which nothing is asked
+            corners = np.pad(boxes[-1], ((0, 0), (0, 1)))  # a depth, which does not count
             newest = self._crop.normalise(corners, size)[:, :2]
             inside = bool(np.all((newest >= 0.0) & (newest <= 1.0)))
-            ratio = self._crop.side / fresh.side
-            if inside and 1 / SIZE_CHANGE <= ratio <= SIZE_CHANGE:
-                return False
+            if inside and 1 / SIZE_CHANGE <= self._crop.side / fresh.side <= SIZE_CHANGE:
+                return self._crop, False
         self._crop = fresh
-        for frame in self._seen:
-            frame.picture = frame.features = None
-        return True
+        for frame in self._frames:
+            frame.cut = frame.features = None
+        return fresh, True
 
     def _features(
         self,
+        network: NetworkForecaster,
+        crop: Crop,
         wanted: NDArray[np.float64],
         times: NDArray[np.float64],
         points: NDArray[np.floating],
         size: tuple[int, int],
     ) -> list[Any]:
-        """Features of the frames nearest to the times (P,) that pictures are wanted of."""
-        assert self._crop is not None
-        span = self._forecasting.span
-        chosen = nearest(wanted[span - 1 :], times).tolist()
+        """Features of the frames nearest to the last P - K + 1 of the ``wanted`` times."""
+        count = network.needs.frames - network.span + 1
+        chosen = nearest(wanted[-count:], times).tolist()
         for number in sorted(set(chosen)):
-            frame = self._seen[number]
+            frame = self._frames[number]
             if frame.features is None:
-                back = times_back(frame.time, span, self._settings.fps)
-                near = self._crop.normalise(landmarks_at(back, times, points), size)
-                pictures = [self._picture(n) for n in nearest(back, times).tolist()]
-                frame.features = self._forecasting.features(
-                    near[..., :2].astype(np.float32), np.stack(pictures)
-                )
-        return [self._seen[number].features for number in chosen]
+                back = times_back(frame.time, network.span, self._settings.fps)
+                near = crop.normalise(landmarks_at(back, times, points), size)
+                cuts = [self._cut(self._frames[n], crop) for n in nearest(back, times).tolist()]
+                frame.features = network.features(near[..., :2].astype(np.float32), np.stack(cuts))
+        return [self._frames[number].features for number in chosen]
 
-    def _picture(self, number: int) -> NDArray[np.uint8]:
-        """The picture (S, S, 3) of one of the frames seen, at the present crop."""
-        frame = self._seen[number]
-        if frame.picture is None:
-            assert self._crop is not None
+    def _cut(self, frame: _Frame, crop: Crop) -> NDArray[np.uint8]:
+        """The image (S, S, 3) of a frame that the network sees."""
+        if frame.cut is None:
             assert frame.image is not None
-            size = self._forecasting.needs.size
-            frame.picture = dataset_picture(frame.image, self._crop, self._settings, size)
-        return frame.picture
-
-
-class NetworkForecasting:
-    """Features and forecasts of one network, in eval mode.
-
-    Args:
-        network: on its device.
-        name: what messages call it.
-
-    Raises:
-        RequestError: the network forecasts no landmarks.
-    """
-
-    def __init__(self, network: PredictorModel, name: str) -> None:
-        self._network = network.eval()
-        self._device = next(network.parameters()).device
-        needs = network.needs
-        # a first run, which takes longer than others, before a camera waits for it
-        still = np.zeros((network.history, NUM_LANDMARKS, 2), dtype=np.float32)
-        black = np.zeros((network.span, needs.size, needs.size, 3), dtype=np.uint8)
-        features = self.features(still[: network.span], black)
-        ahead = self._decode(still, [features] * (needs.frames - network.span + 1), black[-1])
-        if ahead is None:
-            raise RequestError(f"{name}: forecasts pictures and no landmarks; use another network")
-
-    @property
-    def needs(self) -> PictureNeeds:
-        """Which pictures it looks at."""
-        return self._network.needs
-
-    @property
-    def span(self) -> int:
-        """K."""
-        return self._network.span
-
-    def features(self, landmarks: NDArray[np.float32], pictures: NDArray[np.uint8]) -> Any:
-        """Features (1, 1, ...) of one frame, from landmarks (K, L, 2) and pictures (K, S, S, 3)."""
-        import torch
-
-        with torch.inference_mode():
-            return self._network.encode(self._tensor(landmarks), self._tensor(pictures))
-
-    def forecast(
-        self,
-        landmarks: NDArray[np.float32],
-        features: list[Any],
-        last_picture: NDArray[np.uint8] | None,
-    ) -> NDArray[np.float32]:
-        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features."""
-        assert last_picture is not None
-        ahead = self._decode(landmarks[-self._network.history :], features, last_picture)
-        assert ahead is not None
-        return ahead
-
-    def _decode(
-        self,
-        landmarks: NDArray[np.float32],
-        features: list[Any],
-        last_picture: NDArray[np.uint8],
-    ) -> NDArray[np.float32] | None:
-        import torch
-
-        with torch.inference_mode():
-            output = self._network.decode(
-                self._tensor(landmarks),
-                torch.cat(features, dim=1),
-                self._tensor(last_picture),
-                make_images=False,
-            )
-        return None if output.landmarks is None else output.landmarks[0].float().cpu().numpy()
-
-    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
-        """A batch of one, on the network's device."""
-        import torch
-
-        return torch.from_numpy(np.ascontiguousarray(values))[None].to(self._device)
+            size = self._forecaster.needs.size
+            frame.cut = dataset_picture(frame.image, crop, self._settings, size)
+        return frame.cut

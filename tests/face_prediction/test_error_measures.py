@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from face_prediction.evaluation import (
-    cluster_bootstrap,
+from face_prediction.evaluation.statistics import bootstrap_mean
+from face_prediction.prediction.errors import (
     mouth_distances,
+    mouth_errors,
     mouth_residuals,
     normalised_mean_errors,
     skill,
 )
-from face_prediction.evaluation.errors import mouth_errors
 from face_prediction.tracking.lifting import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -144,11 +144,11 @@ def test_interval_of_independent_rows_is_that_of_scipy(subjects: list[str]) -> N
 
     values = np.random.default_rng(2).normal(3.0, 1.0, 80)
     # one row a person leaves the second stage nothing to choose, one person the first
-    ours = cluster_bootstrap(values, subjects, resamples=4000)
+    ours = bootstrap_mean(values, subjects, resamples=4000)
     theirs = stats.bootstrap(
         (values,), np.mean, n_resamples=4000, method="percentile", rng=np.random.default_rng(3)
     ).confidence_interval
-    assert float(ours.estimate) == pytest.approx(values.mean())
+    assert float(ours.value) == pytest.approx(values.mean())
     # the ends of 4000 resamples are off by about 0.005, for a standard error of 0.11
     assert float(ours.low) == pytest.approx(theirs.low, abs=0.02)
     assert float(ours.high) == pytest.approx(theirs.high, abs=0.02)
@@ -159,12 +159,11 @@ def test_people_widen_the_interval() -> None:
     people = rng.normal(0, 1, 12)
     subjects = [f"s{i // 40}" for i in range(480)]
     values = np.repeat(people, 40) + rng.normal(0, 0.1, 480)
-    ours = cluster_bootstrap(values, subjects)
-    assert ours.clusters == 12
+    ours = bootstrap_mean(values, subjects)
     # the mean of 12 people of standard deviation s has standard error s / sqrt(12)
     expected = 2 * 1.96 * people.std() / np.sqrt(12)
     assert float(ours.high - ours.low) == pytest.approx(expected, rel=0.15)
-    each_alone = cluster_bootstrap(values, [f"s{i}" for i in range(480)])
+    each_alone = bootstrap_mean(values, [f"s{i}" for i in range(480)])
     assert float(ours.high - ours.low) > 3 * float(each_alone.high - each_alone.low)
 
 
@@ -176,26 +175,27 @@ def test_interval_covers_as_often_as_it_says() -> None:
         people = rng.normal(0, 1, 30)
         values = np.repeat(people, 5) + rng.normal(0, 1, 150)
         subjects = [f"s{i // 5}" for i in range(150)]
-        found = cluster_bootstrap(values, subjects, level=0.9, resamples=200, seed=trial)
+        found = bootstrap_mean(values, subjects, level=0.9, resamples=200, seed=trial)
         covered += bool(found.low <= 0 <= found.high)
     # 150 trials at 0.9: standard deviation 3.7; percentile intervals of 30 people fall short a bit
     assert 122 <= covered <= 148
 
 
-def test_statistic_sees_whole_rows() -> None:
+def test_a_resample_holds_whole_rows() -> None:
     rng = np.random.default_rng(6)
     errors = rng.uniform(0.5, 1.5, (60, 5))
     both = np.stack([errors, 2 * errors], axis=-1)  # always half as wrong
     subjects = [f"s{i % 9}" for i in range(60)]
-    gained = cluster_bootstrap(both, subjects, lambda rows: skill(rows[..., 0], rows[..., 1]))
-    np.testing.assert_allclose(np.stack([gained.estimate, gained.low, gained.high]), 0.5)
-    assert gained.low.shape == (5,)
+    found = bootstrap_mean(both, subjects)
+    for part in (found.value, found.low, found.high):
+        assert part.shape == (5, 2)
+        np.testing.assert_allclose(part[:, 0] / part[:, 1], 0.5)
 
 
 def test_interval_repeats_with_its_seed() -> None:
     values, subjects = np.arange(20.0), [f"s{i % 4}" for i in range(20)]
     first, again, other = (
-        cluster_bootstrap(values, subjects, seed=s, resamples=99) for s in (1, 1, 2)
+        bootstrap_mean(values, subjects, seed=s, resamples=99) for s in (1, 1, 2)
     )
     assert (first.low, first.high) == (again.low, again.high)
     assert (first.low, first.high) != (other.low, other.high)
@@ -203,13 +203,13 @@ def test_interval_repeats_with_its_seed() -> None:
 
 def test_rows_without_a_forecast_are_left_out() -> None:
     values = np.array([1.0, np.nan, 3.0, np.nan])
-    found = cluster_bootstrap(values, ["a", "a", "b", "b"], resamples=200)
-    assert float(found.estimate) == 2.0
+    found = bootstrap_mean(values, ["a", "a", "b", "b"], resamples=200)
+    assert float(found.value) == 2.0
     assert 1.0 <= float(found.low) <= float(found.high) <= 3.0
     one_column = np.stack([values, np.full(4, np.nan)], axis=-1)
-    found = cluster_bootstrap(one_column, ["a", "a", "b", "b"], resamples=200)
+    found = bootstrap_mean(one_column, ["a", "a", "b", "b"], resamples=200)
     assert np.isfinite([found.low[0], found.high[0]]).all()
-    assert np.isnan([found.estimate[1], found.low[1], found.high[1]]).all()
+    assert np.isnan([found.value[1], found.low[1], found.high[1]]).all()
 
 
 @pytest.mark.parametrize(
@@ -226,4 +226,4 @@ def test_wrong_bootstrap_is_refused(
     values: np.ndarray, subjects: list[str], options: dict, told: str
 ) -> None:
     with pytest.raises(RequestError, match=told):
-        cluster_bootstrap(values, subjects, **options)
+        bootstrap_mean(values, subjects, **options)

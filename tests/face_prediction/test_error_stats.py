@@ -13,16 +13,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from face_prediction.evaluation import (
+from face_prediction.evaluation.error_stats import (
     PAPER_CAMERA,
     Camera,
-    ErrorStats,
+    MouthResiduals,
+    PredictorErrorStats,
+    autocorrelation,
     data_hash,
-    load_error_stats,
+    load_predictor_error_stats,
     measure_error_stats,
-    save_error_stats,
+    neighbours,
+    save_predictor_error_stats,
 )
-from face_prediction.evaluation.error_stats import autocorrelation, neighbours
 from robo_manip_baselines.runs.errors import RequestError
 
 STRIDE = 5
@@ -38,20 +40,15 @@ def correlated_residuals(seed: int = 0) -> tuple[np.ndarray, list[str], list[str
     return residuals, clips, subjects, [STRIDE * (i % 50) for i in range(200)]
 
 
-def measured(residuals: np.ndarray | None = None, **options: Any) -> ErrorStats:
-    example, clips, subjects, starts = correlated_residuals()
-    defaults: dict[str, Any] = {
-        "predictor": "kalman",
-        "footage": "natural",
-        "data_sha256": data_hash(example),
-        "stride_frames": STRIDE,
-    }
-    chosen = example if residuals is None else residuals
-    return measure_error_stats(chosen, clips, subjects, starts, **{**defaults, **options})
+def measured(residuals: np.ndarray | None = None, **options: Any) -> PredictorErrorStats:
+    example, *places = correlated_residuals()
+    values = example if residuals is None else residuals
+    given = MouthResiduals(values, *places, STRIDE, "kalman", data_hash(example))
+    return measure_error_stats(given, "natural", **options)
 
 
 @pytest.fixture(scope="module")
-def stats() -> ErrorStats:
+def stats() -> PredictorErrorStats:
     return measured()
 
 
@@ -66,7 +63,7 @@ def test_equations_6_and_7_give_the_papers_metres() -> None:
 def test_paper_means_go_through_the_file_as_metres(tmp_path: Path) -> None:
     signs = np.where(np.arange(200) % 2, 1.0, -1.0)[:, None, None]
     stats = measured(np.broadcast_to([0.015, 0.017], (200, 5, 2)) * signs)
-    save_error_stats(tmp_path / "error_stats.json", stats)
+    save_predictor_error_stats(tmp_path / "error_stats.json", stats)
     stored = json.loads((tmp_path / "error_stats.json").read_text())
     for horizon in stored["horizons"]:
         np.testing.assert_allclose(horizon["mean_abs"], [0.015, 0.017])
@@ -85,7 +82,7 @@ def test_metres_scale_with_depth_and_crop() -> None:
         Camera(depth_m=float("nan"))
 
 
-def test_each_horizon_is_measured(stats: ErrorStats) -> None:
+def test_each_horizon_is_measured(stats: PredictorErrorStats) -> None:
     residuals = correlated_residuals()[0]
     assert [h.frames for h in stats.horizons] == [1, 2, 3, 4, 5]
     for h, horizon in enumerate(stats.horizons):
@@ -101,7 +98,7 @@ def test_each_horizon_is_measured(stats: ErrorStats) -> None:
     assert (stats.sequences, stats.subjects) == (200, 2)
 
 
-def test_covariance_is_that_of_numpy(stats: ErrorStats) -> None:
+def test_covariance_is_that_of_numpy(stats: PredictorErrorStats) -> None:
     flat = correlated_residuals()[0].reshape(200, 10)
     np.testing.assert_allclose(stats.covariance, np.cov(flat.T, bias=True), rtol=1e-10)
 
@@ -149,19 +146,19 @@ def test_missing_forecasts_cut_runs() -> None:
         measured(np.full((200, 5, 2), np.nan))
 
 
-def test_runs_hold_the_residuals(stats: ErrorStats) -> None:
+def test_runs_hold_the_residuals(stats: PredictorErrorStats) -> None:
     runs = np.concatenate([np.array(run.values) for run in stats.residuals])
     np.testing.assert_allclose(runs, correlated_residuals()[0], atol=0.5e-6)
     assert {run.subject for run in stats.residuals[:2]} == {"subject0"}
     assert measured(keep_runs=False).residuals == ()
 
 
-def test_file_gives_back_what_was_written(stats: ErrorStats, tmp_path: Path) -> None:
+def test_file_gives_back_what_was_written(stats: PredictorErrorStats, tmp_path: Path) -> None:
     path = tmp_path / "new" / "error_stats.json"
-    save_error_stats(path, stats)
-    assert load_error_stats(path) == stats
-    save_error_stats(path, replace(stats, footage="[ 1,  2 ] grid"))
-    assert load_error_stats(path).footage == "[ 1,  2 ] grid"
+    save_predictor_error_stats(path, stats)
+    assert load_predictor_error_stats(path) == stats
+    save_predictor_error_stats(path, replace(stats, footage="[ 1,  2 ] grid"))
+    assert load_predictor_error_stats(path).footage == "[ 1,  2 ] grid"
     assert [p.name for p in path.parent.iterdir()] == ["error_stats.json"]
     stored = json.loads(path.read_text())
     assert (stored["schema"], stored["version"]) == ("error_stats", 1)
@@ -174,8 +171,8 @@ def test_any_measured_file_is_valid(tmp_path_factory: pytest.TempPathFactory, se
     residuals = np.random.default_rng(seed).standard_cauchy((200, 5, 2)) * 1e-3
     path = tmp_path_factory.mktemp("stats") / "error_stats.json"
     stats = measured(residuals)
-    save_error_stats(path, stats)
-    assert load_error_stats(path) == stats
+    save_predictor_error_stats(path, stats)
+    assert load_predictor_error_stats(path) == stats
 
 
 Change = Callable[[dict[str, Any]], object]
@@ -197,17 +194,20 @@ Change = Callable[[dict[str, Any]], object]
         (lambda s: s.update(data_sha256="abc"), "'data_sha256'"),
         (lambda s: s.update(equations=["dx = dU"]), "'equations'"),
         (lambda s: s.update(quantile_levels=[0.5, 0.05]), "'quantile_levels'"),
-        (lambda s: s.update(camera=None), "'camera' is missing"),
+        (lambda s: s.update(camera=None), "'camera' is not of type Camera"),
         (lambda s: s["camera"].pop("depth_m"), "'camera.depth_m' is missing"),
         (lambda s: s["camera"].update(fov_x_deg=190), "fov_x_deg 190"),
         (lambda s: s["camera"].update(depth_m=0.6), "'horizons[0].mean_abs_m' does not follow"),
-        (lambda s: s.update(horizons={}), "'horizons' is missing"),
+        (lambda s: s.update(horizons={}), "'horizons' is not of type"),
         (lambda s: s.update(horizons=[]), "'horizons' must be"),
         (lambda s: s["horizons"].pop(0), "'horizons' must be 1, 2"),
         (lambda s: s["horizons"][2].pop("bias"), "'horizons[2].bias' is missing"),
         (lambda s: s["horizons"][2].update(bias=[9, 9]), "'horizons[2].bias' must not exceed"),
         (lambda s: s["horizons"][1].update(var_abs=[-1e-9, 0.0]), "'horizons[1].var_abs'"),
-        (lambda s: s["horizons"][1].update(var_abs=[1e-9]), "'horizons[1].var_abs' must be two"),
+        (
+            lambda s: s["horizons"][1].update(var_abs=[1e-9]),
+            "'horizons[1].var_abs' must be finite, of shape (2)",
+        ),
         (lambda s: s["horizons"][1].update(mean_abs=["x", 1]), "'horizons[1].mean_abs' is not"),
         (lambda s: s["horizons"][1].update(mean_abs=[float("nan"), 1]), "'horizons[1].mean_abs'"),
         (lambda s: s["horizons"][4]["quantiles"][1].reverse(), "'horizons[4].quantiles'"),
@@ -222,15 +222,15 @@ Change = Callable[[dict[str, Any]], object]
     ],
 )
 def test_broken_file_is_refused_by_name(
-    stats: ErrorStats, tmp_path: Path, change: Change, told: str
+    stats: PredictorErrorStats, tmp_path: Path, change: Change, told: str
 ) -> None:
     path = tmp_path / "error_stats.json"
-    save_error_stats(path, stats)
+    save_predictor_error_stats(path, stats)
     stored = json.loads(path.read_text())
     change(stored)
     path.write_text(json.dumps(stored))
     with pytest.raises(RequestError) as error:
-        load_error_stats(path)
+        load_predictor_error_stats(path)
     assert told in str(error.value)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
@@ -241,24 +241,24 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "error_stats.json"
     path.write_bytes(content.encode("latin-1"))
     with pytest.raises(RequestError, match=r"error_stats\.json"):
-        load_error_stats(path)
+        load_predictor_error_stats(path)
     with pytest.raises(RequestError, match="no such file"):
-        load_error_stats(tmp_path / "absent.json")
+        load_predictor_error_stats(tmp_path / "absent.json")
 
 
 def test_failed_write_leaves_the_old_file(
-    stats: ErrorStats, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stats: PredictorErrorStats, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "error_stats.json"
-    save_error_stats(path, stats)
+    save_predictor_error_stats(path, stats)
 
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("face_prediction.whole_file.os.fsync", fail)
+    monkeypatch.setattr("robo_manip_baselines.runs.files.os.fsync", fail)
     with pytest.raises(OSError, match="disk full"):
-        save_error_stats(path, replace(stats, predictor="other"))
-    assert load_error_stats(path) == stats
+        save_predictor_error_stats(path, replace(stats, predictor="other"))
+    assert load_predictor_error_stats(path) == stats
     assert [p.name for p in tmp_path.iterdir()] == ["error_stats.json"]
 
 
@@ -276,12 +276,5 @@ def test_lengths_must_agree() -> None:
     residuals, clips, subjects, starts = correlated_residuals()
     with pytest.raises(RequestError, match="199 starts"):
         measure_error_stats(
-            residuals,
-            clips,
-            subjects,
-            starts[1:],
-            predictor="p",
-            footage="f",
-            data_sha256="0" * 64,
-            stride_frames=1,
+            MouthResiduals(residuals, clips, subjects, starts[1:], 1, "p", "0" * 64), "f"
         )

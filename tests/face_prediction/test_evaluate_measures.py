@@ -10,10 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from face_prediction.evaluation.batches import DETECTOR_SIDE, DetectedPredictor, find_landmarks
-from face_prediction.evaluation.calibration import LEVELS, covered, interval_levels
-from face_prediction.evaluation.errors import area_average, similarities
-from face_prediction.evaluation.setup import BaselinePredictor
+from face_prediction.evaluation.errors import (
+    LEVELS,
+    area_average,
+    coverage,
+    interval_levels,
+    similarities,
+)
+from face_prediction.evaluation.predictors import (
+    DETECTOR_SIDE,
+    BaselinePredictor,
+    DetectedPredictor,
+    find_landmarks,
+)
 from face_prediction.forecast.simple import ConstantVelocity, Persistence
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.detector import FaceDetection
@@ -76,7 +85,7 @@ def test_intervals_hold_what_they_promise(freedom: float) -> None:
     if np.isfinite(freedom):
         noise = rng.standard_t(freedom, scale.shape)
     levels = interval_levels(noise * scale, scale, np.full((2, 2), freedom))
-    share = covered(levels).mean(axis=(0, 1))
+    share = coverage(levels).mean(axis=(0, 1))
     # 80 000 draws: a standard error of 0.002 or less
     np.testing.assert_allclose(share, LEVELS, atol=0.008)
 
@@ -85,14 +94,14 @@ def test_an_interval_ends_where_the_distribution_says() -> None:
     edge = stats.t.ppf(0.95, 4.0)  # of the central 90 %
     residuals = 0.01 * np.array([[[edge - 1e-6, -edge + 1e-6]], [[edge + 1e-6, -edge - 1e-6]]])
     levels = interval_levels(residuals, np.full((2, 1, 2), 0.01), np.full((1, 2), 4.0))
-    np.testing.assert_array_equal(covered(levels, (0.9,))[:, 0, 0], [1.0, 0.0])
+    np.testing.assert_array_equal(coverage(levels, (0.9,))[:, 0, 0], [1.0, 0.0])
     normal = interval_levels(residuals, np.full((2, 1, 2), 0.01), np.full((1, 2), np.inf))
     np.testing.assert_allclose(normal, 2 * stats.norm.cdf(100 * np.abs(residuals)) - 1)
 
 
 def test_half_of_u_and_v_may_be_covered_and_what_is_missing_is_not_counted() -> None:
     levels = np.array([[[0.2, 0.8]], [[np.nan, np.nan]]])
-    np.testing.assert_array_equal(covered(levels, (0.5, 0.9)), [[[0.5, 1.0]], [[np.nan] * 2]])
+    np.testing.assert_array_equal(coverage(levels, (0.5, 0.9)), [[[0.5, 1.0]], [[np.nan] * 2]])
 
 
 def test_intervals_need_positive_scales() -> None:
@@ -184,5 +193,5 @@ def test_a_baseline_copies_the_last_picture_and_forecasts_as_ever() -> None:
     assert copied.shape == (2, 4, 16, 16, 3)
     np.testing.assert_array_equal(copied[:, 3], shown[:, 0])
     for wrong in (None, shown[:1], shown[:, :, :8]):
-        with pytest.raises(RequestError, match="persistence: pictures of shape"):
+        with pytest.raises(RequestError, match="persistence: images of shape"):
             copying.predict(history, wrong, 4)

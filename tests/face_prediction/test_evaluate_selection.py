@@ -1,9 +1,10 @@
-"""Who is forecast by whom, and whose pictures stand in for whose."""
+"""Grouping of checkpoints, their common folds, and the permutation of the image ablation."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.evaluation.setup import common_folds, exchange_pictures, networks
+from face_prediction.evaluation.predictors import FittedPredictor, group_networks
+from face_prediction.evaluation.setup import common_folds, shuffled_partners
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -21,9 +23,6 @@ class Network:
     """A network that is never run."""
 
     name: str
-    test_fold: int
-    preset: str = "cpu"
-    train_subjects: tuple[str, ...] = ("ann",)
     memory: int | None = 2
     needs = PictureNeeds(0, 0)
 
@@ -31,33 +30,42 @@ class Network:
         raise NotImplementedError
 
 
-def given_networks(*pairs: tuple[str, int, str]) -> list[tuple[Path, Network]]:
-    return [(Path(f"{n}_{fold}_{p}"), Network(n, fold, p)) for n, fold, p in pairs]
+def loaded(*given: tuple[str, int, str], folders: tuple[str, ...] = ()) -> list[FittedPredictor]:
+    """Networks by name, test fold and preset."""
+    return [
+        FittedPredictor(
+            Network(name),
+            frozenset({"ann"}),
+            Path(folder or f"{name}_{fold}_{preset}"),
+            {"name": name, "test_fold": fold, "preset": preset},
+        )
+        for (name, fold, preset), folder in zip_longest(given, folders)
+    ]
 
 
 def test_checkpoints_of_one_network_are_one_row() -> None:
-    rows = networks(given_networks(("a", 1, "cpu"), ("b", 0, "cpu"), ("a", 0, "cpu")))
-    assert [(row.name, row.role, row.folds) for row in rows] == [
+    rows = group_networks(loaded(("a", 1, "cpu"), ("b", 0, "cpu"), ("a", 0, "cpu")))
+    assert [(row.name, row.role, tuple(row.by_fold)) for row in rows] == [
         ("a", "network", (0, 1)),
         ("b", "network", (0,)),
     ]
-    assert rows[0].fit.by_fold[1].subjects == {"ann"}
+    assert rows[0].by_fold[1].subjects == {"ann"}
     assert common_folds(rows) == (0,)
 
 
 def test_two_presets_are_two_rows_that_can_be_told_apart() -> None:
-    rows = networks(given_networks(("a", 0, "cpu"), ("a", 0, "paper"), ("b", 0, "cpu")))
+    rows = group_networks(loaded(("a", 0, "cpu"), ("a", 0, "paper"), ("b", 0, "cpu")))
     assert [row.name for row in rows] == ["a (cpu)", "a (paper)", "b"]
 
 
 def test_the_same_network_twice_for_a_fold_is_refused_by_name() -> None:
-    pairs = [(Path("one"), Network("a", 2)), (Path("two"), Network("a", 2))]
-    with pytest.raises(RequestError, match=r"one and two are both a \(cpu\) for fold 2"):
-        networks(pairs)
+    twice = loaded(("a", 2, "cpu"), ("a", 2, "cpu"), ("a", 2, "paper"), folders=("one", "two"))
+    with pytest.raises(RequestError, match=r"one and two are both a \(cpu\) for test fold 2"):
+        group_networks(twice)
 
 
 def test_networks_without_a_common_fold_are_refused() -> None:
-    rows = networks(given_networks(("a", 1, "cpu"), ("a", 2, "cpu"), ("b", 0, "cpu")))
+    rows = group_networks(loaded(("a", 1, "cpu"), ("a", 2, "cpu"), ("b", 0, "cpu")))
     with pytest.raises(RequestError, match=r"no fold is covered by all .*a: 1, 2; b: 0"):
         common_folds(rows)
 
@@ -68,16 +76,16 @@ people = st.lists(
 
 
 @given(people, st.integers(0, 5))
-def test_pictures_are_exchanged_within_a_kind_and_nobody_keeps_theirs(
+def test_images_are_shuffled_within_a_kind_and_nobody_keeps_theirs(
     who: list[tuple[str, str]], seed: int
 ) -> None:
     kinds = [kind for kind, _ in who]
     subjects = [kind + name for kind, name in who]
     if min(Counter(kinds).values()) < 2:
         with pytest.raises(RequestError, match="one sequence"):
-            exchange_pictures(kinds, subjects, seed)
+            shuffled_partners(kinds, subjects, seed)
         return
-    partner = exchange_pictures(kinds, subjects, seed)
+    partner = shuffled_partners(kinds, subjects, seed)
     assert sorted(partner.tolist()) == list(range(len(who)))
     assert not np.any(partner == np.arange(len(who)))
     assert [kinds[p] for p in partner] == kinds
@@ -88,8 +96,8 @@ def test_pictures_are_exchanged_within_a_kind_and_nobody_keeps_theirs(
             assert not any(own)
 
 
-def test_the_exchange_follows_from_the_seed() -> None:
+def test_the_permutation_follows_from_the_seed() -> None:
     kinds, subjects = ["natural"] * 40, [f"s{i % 7}" for i in range(40)]
-    first = exchange_pictures(kinds, subjects, 1)
-    np.testing.assert_array_equal(first, exchange_pictures(kinds, subjects, 1))
-    assert np.any(first != exchange_pictures(kinds, subjects, 2))
+    first = shuffled_partners(kinds, subjects, 1)
+    np.testing.assert_array_equal(first, shuffled_partners(kinds, subjects, 1))
+    assert np.any(first != shuffled_partners(kinds, subjects, 2))

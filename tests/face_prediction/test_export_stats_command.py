@@ -12,12 +12,20 @@ import pytest
 
 from face_prediction.commands import export_stats as export_stats_command
 from face_prediction.commands.cli import main
-from face_prediction.commands.export_stats import ExportStatsOptions, run_export_stats
+from face_prediction.commands.export_stats import (
+    ExportStatsOptions,
+    median_crop_span,
+    run_export_stats,
+)
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.evaluation import Camera, load_error_stats
-from face_prediction.evaluation import setup as cross_fit_module
-from face_prediction.evaluation.library_errors import camera_with_crop, crop_spans
-from face_prediction.evaluation.setup import CrossFit, Fitted, batch_size, cross_fit
+from face_prediction.evaluation import predictors
+from face_prediction.evaluation.error_stats import Camera, load_predictor_error_stats
+from face_prediction.evaluation.predictors import (
+    EvaluatedPredictor,
+    FittedPredictor,
+    batch_size,
+    cross_fit,
+)
 from face_prediction.motion.library import MotionLibrary, save_library
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.crop import crop_around
@@ -93,14 +101,14 @@ class Watched:
         return Forecast(ahead.astype(np.float32))
 
 
-def use(monkeypatch, fits: CrossFit) -> None:
+def use(monkeypatch, fits: EvaluatedPredictor) -> None:
     monkeypatch.setattr(export_stats_command, "cross_fit", lambda *_: fits)
 
 
 def test_the_papers_numbers_give_its_metres(options, capsys) -> None:
     # section IV.C: dU 0.015, dV 0.017, 75 x 47 degrees, 0.5 m, the crop taken for the image
     assert run_export_stats(replace(options, crop_width=1.0, crop_height=1.0)) == 0
-    stats = load_error_stats(options.out)
+    stats = load_predictor_error_stats(options.out)
     for horizon in stats.horizons:
         assert horizon.mean_abs == pytest.approx((0.015, 0.017), abs=2e-6)  # float32 landmarks
         assert horizon.bias == pytest.approx((-0.015, -0.017), abs=2e-6)  # v is down
@@ -111,49 +119,49 @@ def test_the_papers_numbers_give_its_metres(options, capsys) -> None:
 def test_metres_are_those_of_the_face(options, caplog) -> None:
     caplog.set_level(logging.INFO)
     assert run_export_stats(options) == 0
-    stats = load_error_stats(options.out)
+    stats = load_predictor_error_stats(options.out)
     with FaceDataset(options.dataset) as dataset:
-        (span,) = set(crop_spans(dataset, ["ann", "cat"]).tolist())
+        span = median_crop_span(dataset, ["ann", "cat"])
     # what the mouth really moved, whatever camera is asked about
     assert stats.horizons[4].mean_abs_m == pytest.approx((0.015 * span, 0.017 * span), abs=1e-6)
     assert stats.camera.crop_width == pytest.approx(span / (2 * 0.5 * math.tan(math.radians(37.5))))
     assert f"crops span {span:.3f} m" in caplog.text
     assert run_export_stats(replace(options, depth_m=0.8, fov_x_deg=60.0)) == 0
-    other = load_error_stats(options.out)
+    other = load_predictor_error_stats(options.out)
     assert other.horizons[4].mean_abs_m == pytest.approx(stats.horizons[4].mean_abs_m)
 
 
 @pytest.mark.parametrize(("number", "clip"), [(1, "bob"), (3, "nod")])
 def test_a_crop_spans_what_its_edges_see(dataset: Path, project, number: int, clip: str) -> None:
     with FaceDataset(dataset) as opened:
-        spans = crop_spans(opened, [clip])
+        span = median_crop_span(opened, [clip])
         row = opened.rows()[number]
     assert row.clip == clip
     side = row.facts["crop_side"]
-    ends = np.array([[-spans[0] / 2, 0.0, -DEPTH], [spans[0] / 2, 0.0, -DEPTH]])
+    ends = np.array([[-span / 2, 0.0, -DEPTH], [span / 2, 0.0, -DEPTH]])
     left, right = project(ends, SIZE)[:, 0] * SIZE[0]
     assert right - left == pytest.approx(side, rel=1e-4)  # the depth is lifted, from float32
 
 
 def test_a_crop_as_large_as_the_view_is_the_image() -> None:
     across, up = Camera().metres(np.ones(2))
-    assert camera_with_crop(Camera(), across).crop_width == pytest.approx(1.0)
-    assert camera_with_crop(Camera(), up).crop_height == pytest.approx(1.0)
-    assert camera_with_crop(Camera(), 0.2, 0.3, 0.4) == Camera(crop_width=0.3, crop_height=0.4)
+    assert Camera().with_crop(across).crop_width == pytest.approx(1.0)
+    assert Camera().with_crop(up).crop_height == pytest.approx(1.0)
+    assert Camera().with_crop(0.2, 0.3, 0.4) == Camera(crop_width=0.3, crop_height=0.4)
     narrow = Camera(crop_width=0.1, crop_height=0.1)
-    assert camera_with_crop(narrow, 0.2) == camera_with_crop(Camera(), 0.2)
+    assert narrow.with_crop(0.2) == Camera().with_crop(0.2)
 
 
 def test_what_the_file_says(options) -> None:
     assert run_export_stats(options) == 0
-    stats = load_error_stats(options.out)
+    stats = load_predictor_error_stats(options.out)
     assert (stats.predictor, stats.footage, stats.fps) == ("persistence", "natural", 30.0)
     assert (stats.sequences, stats.subjects, stats.stride_frames) == (3, 3, 1)
     assert [run.subject for run in stats.residuals] == ["ann", "bob", "cat"]
     assert run_export_stats(replace(options, keep_runs=False)) == 0
-    assert load_error_stats(options.out).residuals == ()
+    assert load_predictor_error_stats(options.out).residuals == ()
     assert run_export_stats(replace(options, kind="head_motion")) == 0
-    assert load_error_stats(options.out).horizons[0].mean_abs == pytest.approx(
+    assert load_predictor_error_stats(options.out).horizons[0].mean_abs == pytest.approx(
         (0.03, 0.034), abs=1e-5
     )
 
@@ -170,10 +178,12 @@ def test_each_fold_is_forecast_by_its_own_predictor(options, monkeypatch) -> Non
     with FaceDataset(options.dataset) as dataset:
         fold_of = {clip.subject: clip.fold or 0 for clip in dataset.manifest.clips}
     watched = {fold: Watched((0.1 * fold, 0.0)) for fold in range(3)}
-    fits = CrossFit("watched", {f: Fitted(w, frozenset()) for f, w in watched.items()})
+    fits = EvaluatedPredictor(
+        "watched", {f: FittedPredictor(w, frozenset()) for f, w in watched.items()}
+    )
     use(monkeypatch, fits)
     assert run_export_stats(options) == 0
-    for run in load_error_stats(options.out).residuals:
+    for run in load_predictor_error_stats(options.out).residuals:
         expected = 0.1 * fold_of[run.subject] - 0.015
         assert run.values[0][2][0] == pytest.approx(expected, abs=2e-6)
     for predictor in watched.values():
@@ -184,7 +194,12 @@ def test_each_fold_is_forecast_by_its_own_predictor(options, monkeypatch) -> Non
 
 def test_pictures_are_the_last_of_the_history(options, monkeypatch) -> None:
     watched = Watched(needs=PictureNeeds(3, 32))
-    use(monkeypatch, CrossFit("watched", dict.fromkeys(range(3), Fitted(watched, frozenset()))))
+    use(
+        monkeypatch,
+        EvaluatedPredictor(
+            "watched", dict.fromkeys(range(3), FittedPredictor(watched, frozenset()))
+        ),
+    )
     assert run_export_stats(replace(options, kind="head_motion")) == 0
     ((_, pictures),) = watched.shown
     with FaceDataset(options.dataset) as dataset:
@@ -198,17 +213,17 @@ def test_a_fold_without_a_checkpoint_is_left_out(options, monkeypatch) -> None:
     with FaceDataset(options.dataset) as dataset:
         fold_of = {clip.subject: clip.fold or 0 for clip in dataset.manifest.clips}
     fold = fold_of["bob"]
-    use(monkeypatch, CrossFit("watched", {fold: Fitted(Watched(), frozenset())}))
+    use(monkeypatch, EvaluatedPredictor("watched", {fold: FittedPredictor(Watched(), frozenset())}))
     assert run_export_stats(options) == 0
-    stats = load_error_stats(options.out)
+    stats = load_predictor_error_stats(options.out)
     assert [run.subject for run in stats.residuals] == [
         name for name in ("ann", "bob", "cat") if fold_of[name] == fold
     ]
 
 
 def test_whoever_was_trained_on_is_not_judged(options, monkeypatch) -> None:
-    fits = {fold: Fitted(Watched(), frozenset({"bob", "dora"})) for fold in range(3)}
-    use(monkeypatch, CrossFit("watched", fits))
+    fits = {fold: FittedPredictor(Watched(), frozenset({"bob", "dora"})) for fold in range(3)}
+    use(monkeypatch, EvaluatedPredictor("watched", fits))
     with pytest.raises(RequestError, match="trained on subject 'bob'"):
         run_export_stats(options)
     assert not options.out.exists()
@@ -216,13 +231,13 @@ def test_whoever_was_trained_on_is_not_judged(options, monkeypatch) -> None:
 
 def test_baselines_are_fitted_to_the_others(dataset: Path, monkeypatch) -> None:
     fitted_to: list[set[str]] = []
-    fit = cross_fit_module.fit_forecaster
+    fit = predictors.fit_forecaster
 
     def spy(name, sequences):
         fitted_to.append(set(sequences.subjects))
         return fit(name, sequences)
 
-    monkeypatch.setattr(cross_fit_module, "fit_forecaster", spy)
+    monkeypatch.setattr(predictors, "fit_forecaster", spy)
     with FaceDataset(dataset) as opened:
         fold_of = {clip.subject: clip.fold for clip in opened.manifest.clips}
         fits = cross_fit(opened, (), "constant_velocity")
@@ -231,7 +246,7 @@ def test_baselines_are_fitted_to_the_others(dataset: Path, monkeypatch) -> None:
         assert subjects == {name for name, own in fold_of.items() if own != fold}
         assert fits.by_fold[fold].subjects == subjects
     with pytest.raises(RequestError, match="subject 'new' is in no fold"):
-        fits.of(None, "new")
+        fits.predictor_for(None, "new")
 
 
 @pytest.mark.parametrize(
@@ -239,8 +254,8 @@ def test_baselines_are_fitted_to_the_others(dataset: Path, monkeypatch) -> None:
     [
         ({"baseline": None}, "either --checkpoints .* or --baseline"),
         ({"checkpoints": (Path("a"),)}, "either --checkpoints .* or --baseline"),
-        ({"baseline": "oracle"}, "'oracle'; there are persistence, "),
-        ({"kind": "grid"}, "no sequence of kind 'grid' in fold 0, 1, 2"),
+        ({"baseline": "oracle"}, "unknown baseline 'oracle'; valid: "),
+        ({"kind": "grid"}, "no sequence of kind grid in fold 0, 1, 2"),
         ({"crop_width": -1.0}, "crop_width -1.0; must be above 0"),
         ({"depth_m": 0.0}, "depth_m 0.0; must be above 0"),
         ({"dataset": Path("/nowhere")}, "no dataset"),
@@ -255,8 +270,13 @@ def test_what_cannot_be_done_is_refused(options, change, message: str) -> None:
 
 def test_a_picture_size_that_the_dataset_has_not_is_refused(options, monkeypatch) -> None:
     watched = Watched(needs=PictureNeeds(1, 48))
-    use(monkeypatch, CrossFit("watched", dict.fromkeys(range(3), Fitted(watched, frozenset()))))
-    with pytest.raises(RequestError, match="pictures of 48 pixels: this dataset can give 64, 32, "):
+    use(
+        monkeypatch,
+        EvaluatedPredictor(
+            "watched", dict.fromkeys(range(3), FittedPredictor(watched, frozenset()))
+        ),
+    )
+    with pytest.raises(RequestError, match="images of 48 pixels: this dataset can give 64, 32, "):
         run_export_stats(options)
 
 
@@ -310,23 +330,23 @@ def test_a_library_is_measured_frame_by_frame(dataset: Path, tmp_path: Path) -> 
     library, out = predicted_library(tmp_path), tmp_path / "stats.json"
     command = ["export-stats", "--dataset", str(dataset), "--library", str(library)]
     assert main([*command, "--out", str(out), "--no-progress"]) == 0
-    stats = load_error_stats(out)
+    stats = load_predictor_error_stats(out)
     assert (stats.predictor, stats.stride_frames, stats.subjects) == ("made_up", 1, 1)
     assert [len(run.values) for run in stats.residuals] == [30 - FUTURE, 20 - FUTURE]
     with FaceDataset(dataset) as opened:
-        span = float(crop_spans(opened, ["ann"])[0])
+        span = median_crop_span(opened, ["ann"])
     for h, horizon in enumerate(stats.horizons, start=1):
         # up in the world is up in the image: V, which counts down, is forecast too far down
         np.testing.assert_allclose(horizon.bias, np.array([h, 2 * h]) * 1e-3 / span, rtol=1e-3)
     assert main([*command, "--out", str(out), "--max_run_frames", "30"]) == 0
-    assert [len(run.values) for run in load_error_stats(out).residuals] == [25, 5]
+    assert [len(run.values) for run in load_predictor_error_stats(out).residuals] == [25, 5]
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (["--baseline", "persistence"], "leave --checkpoints and --baseline out"),
-        (["--kind", "grid"], "has no run of the clips"),
+        (["--kind", "grid"], "has no run of kind 'grid'"),
         (["--max_run_frames", "0"], "1 or more"),
     ],
 )

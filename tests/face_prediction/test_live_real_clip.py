@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.live import LiveOptions, run_live
-from face_prediction.live.sources import FaceFinder
+from face_prediction.live.sources import face_finder
 from face_prediction.tracking.video import VideoReader
 
 pytestmark = [pytest.mark.shared, pytest.mark.long]
@@ -35,8 +35,8 @@ def test_a_second_of_a_talking_face(shared_dir: Path, tmp_path: Path, capfd) -> 
     assert len(after) == len(before)
     assert f"| detector | {len(before)} |" in told.out
     # something green where the detector finds the mouth, and was not green before
-    with FaceFinder(model) as finder:
-        landmarks = finder.find(before[-1].image, before[-1].time)
+    with face_finder(model) as find:
+        landmarks = find(before[-1].image, before[-1].time)
     assert landmarks is not None
     height, width = before[-1].image.shape[:2]
     x, y = (landmarks[[13, 14], :2].mean(axis=0) * (width, height)).astype(int)

@@ -12,9 +12,9 @@ from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.settings import SequenceSettings
 from face_prediction.forecast.simple import ConstantVelocity
 from face_prediction.live.streaming import (
-    LandmarkForecasting,
+    LandmarkForecaster,
     LiveForecast,
-    NetworkForecasting,
+    NetworkForecaster,
     StreamingPredictor,
 )
 from face_prediction.prediction.interface import Forecast, PictureNeeds
@@ -109,7 +109,7 @@ def in_crop(forecast: LiveForecast) -> np.ndarray:
 @pytest.mark.parametrize("history", [8, 6])
 def test_it_is_the_batch_predictor_to_the_last_bit(make_track, span: int, history: int) -> None:
     model = toy(history=history, span=span)
-    stream = StreamingPredictor(NetworkForecasting(model, "toy"), SETTINGS)
+    stream = StreamingPredictor(NetworkForecaster(model, "toy"), SETTINGS)
     landmarks, images = sway(make_track, 40), pictures(40)
     laid = 0
     for now in range(40):
@@ -124,7 +124,7 @@ def test_it_is_the_batch_predictor_to_the_last_bit(make_track, span: int, histor
 
 def test_a_frame_costs_one_encoding_while_the_crop_holds(make_track) -> None:
     model = toy(span=2)
-    stream = StreamingPredictor(NetworkForecasting(model, "toy"), SETTINGS)
+    stream = StreamingPredictor(NetworkForecaster(model, "toy"), SETTINGS)
     landmarks, images = sway(make_track, 30, amplitude=0.001), pictures(30)
     model.encoded.clear()
     for now in range(30):
@@ -134,7 +134,7 @@ def test_a_frame_costs_one_encoding_while_the_crop_holds(make_track) -> None:
 
 def test_a_new_crop_encodes_what_still_counts(make_track) -> None:
     model = toy(pictures=5)
-    stream = StreamingPredictor(NetworkForecasting(model, "toy"), SETTINGS)
+    stream = StreamingPredictor(NetworkForecaster(model, "toy"), SETTINGS)
     landmarks, images = sway(make_track, 20, amplitude=0.0), pictures(20)
     landmarks[12:, :, 0] += 0.2  # at once to the side, out of the crop
     counts = []
@@ -153,7 +153,7 @@ def test_a_new_crop_encodes_what_still_counts(make_track) -> None:
 
 def test_only_images_that_may_be_looked_at_again_are_kept(make_track) -> None:
     stream = StreamingPredictor(
-        NetworkForecasting(toy(history=60, pictures=4), "toy"), replace(SETTINGS, history=60)
+        NetworkForecaster(toy(history=60, pictures=4), "toy"), replace(SETTINGS, history=60)
     )
     landmarks, images = sway(make_track, 50, amplitude=0.001), pictures(50)
     kept = [weakref.ref(image) for image in images]
@@ -165,7 +165,7 @@ def test_only_images_that_may_be_looked_at_again_are_kept(make_track) -> None:
 
 def test_the_crop_is_laid_around_the_history(make_track) -> None:
     landmarks, images = sway(make_track, 20), pictures(20)
-    stream = StreamingPredictor(NetworkForecasting(toy(), "toy"), SETTINGS)
+    stream = StreamingPredictor(NetworkForecaster(toy(), "toy"), SETTINGS)
     held = None
     for now in range(20):
         forecast = stream.update(now / 30, landmarks[now], images[now])
@@ -183,7 +183,7 @@ def test_a_face_that_drifts_away_stays_in_its_crop(make_track) -> None:
     landmarks = np.repeat(sway(make_track, 1), 40, axis=0)
     landmarks[:, :, 1] += 0.005 * np.arange(40)[:, None]
     stream = StreamingPredictor(
-        LandmarkForecasting(Still(), 5), replace(SETTINGS, history=4, margin=0.05)
+        LandmarkForecaster(Still(), 5), replace(SETTINGS, history=4, margin=0.05)
     )
     laid = 0
     for now in range(40):
@@ -203,7 +203,7 @@ def test_a_face_that_comes_nearer_or_goes_needs_another_crop(scale: float, is_ne
     rng = np.random.default_rng(0)
     small = 0.5 + 0.1 * (rng.uniform(size=(468, 3)) - 0.5)
     stream = StreamingPredictor(
-        LandmarkForecasting(Still(), 5), replace(SETTINGS, history=1, margin=0.4)
+        LandmarkForecaster(Still(), 5), replace(SETTINGS, history=1, margin=0.4)
     )
     image = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8)
     assert stream.update(0.0, small, image) is not None
@@ -225,10 +225,10 @@ class Still:
 
 
 def test_a_baseline_needs_no_picture(make_track) -> None:
-    from face_prediction.evaluation.setup import BaselinePredictor
+    from face_prediction.evaluation.predictors import BaselinePredictor
 
     predictor = BaselinePredictor(ConstantVelocity())
-    stream = StreamingPredictor(LandmarkForecasting(predictor, 5), SETTINGS)
+    stream = StreamingPredictor(LandmarkForecaster(predictor, 5), SETTINGS)
     landmarks = sway(make_track, 30)
     image = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8)
     for now in range(30):
@@ -249,7 +249,7 @@ def test_a_camera_at_another_rate_is_brought_to_thirty(make_track) -> None:
 
     image = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8)
     for rate in (25.0, 60.0):
-        stream = StreamingPredictor(LandmarkForecasting(Watching(), 5), SETTINGS)
+        stream = StreamingPredictor(LandmarkForecaster(Watching(), 5), SETTINGS)
         shown.clear()
         times = np.arange(40) / rate
         forecast = None
@@ -269,7 +269,7 @@ def test_a_face_that_is_gone_for_a_tenth_of_a_second_is_forgotten(
     make_track, lost: int, known: int
 ) -> None:
     landmarks, images = sway(make_track, 40), pictures(40)
-    stream = StreamingPredictor(NetworkForecasting(toy(), "toy"), SETTINGS)
+    stream = StreamingPredictor(NetworkForecaster(toy(), "toy"), SETTINGS)
     for now in range(12):
         stream.update(now / 30, landmarks[now], images[now])
     for now in range(12, 12 + lost):
@@ -283,7 +283,7 @@ def test_a_face_that_is_gone_for_a_tenth_of_a_second_is_forgotten(
 
 def test_a_reset_forgets_everything(make_track) -> None:
     landmarks, images = sway(make_track, 20), pictures(20)
-    stream = StreamingPredictor(NetworkForecasting(toy(), "toy"), SETTINGS)
+    stream = StreamingPredictor(NetworkForecaster(toy(), "toy"), SETTINGS)
     first = [stream.update(i / 30, landmarks[i], images[i]) for i in range(10)]
     stream.reset()
     second = [stream.update(i / 30, landmarks[i], images[i]) for i in range(10)]
@@ -295,7 +295,7 @@ def test_a_reset_forgets_everything(make_track) -> None:
 
 
 def test_a_frame_of_the_past_is_refused(make_track) -> None:
-    stream = StreamingPredictor(LandmarkForecasting(Still(), 5), SETTINGS)
+    stream = StreamingPredictor(LandmarkForecaster(Still(), 5), SETTINGS)
     landmarks, image = sway(make_track, 1)[0], np.zeros((240, 320, 3), dtype=np.uint8)
     stream.update(1.0, landmarks, image)
     with pytest.raises(ValueError, match=r"a frame at 1.0 s after one at 1.0 s"):
@@ -303,5 +303,5 @@ def test_a_frame_of_the_past_is_refused(make_track) -> None:
 
 
 def test_a_network_without_landmarks_is_refused() -> None:
-    with pytest.raises(RequestError, match="blind: forecasts pictures and no landmarks"):
-        NetworkForecasting(toy(landmarks=False), "blind")
+    with pytest.raises(RequestError, match="blind: forecasts images and no landmarks"):
+        NetworkForecaster(toy(landmarks=False), "blind")

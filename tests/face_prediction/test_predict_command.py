@@ -16,7 +16,7 @@ from face_prediction.commands.predict import PredictOptions, run_predict
 from face_prediction.dataset.history_images import history_pictures
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import clip_frames
-from face_prediction.evaluation.setup import CrossFit, Fitted
+from face_prediction.evaluation.predictors import EvaluatedPredictor, FittedPredictor
 from face_prediction.forecast import mouth_centre
 from face_prediction.motion.library import load_library, save_library
 from face_prediction.prediction.interface import Forecast, PictureNeeds
@@ -131,7 +131,9 @@ class DotFollower:
 
 
 def use(monkeypatch, predictor, subjects=frozenset()) -> None:
-    fits = CrossFit(predictor.name, dict.fromkeys(range(3), Fitted(predictor, subjects)))
+    fits = EvaluatedPredictor(
+        predictor.name, dict.fromkeys(range(3), FittedPredictor(predictor, subjects))
+    )
     monkeypatch.setattr(predict_command, "cross_fit", lambda *_: fits)
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from face_prediction.commands.live import load_forecasting
+from face_prediction.commands.live import load_forecaster
 from face_prediction.dataset.history_images import dataset_picture
 from face_prediction.dataset.manifest import ClipEntry, Manifest, write_manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.evaluation.setup import cross_fit
+from face_prediction.evaluation.predictors import cross_fit
 from face_prediction.live.streaming import StreamingPredictor
 from face_prediction.tracking.video import sha256_of
 from robo_manip_baselines.runs.errors import RequestError
@@ -87,19 +87,19 @@ def test_each_fold_has_its_network(dataset: Path, trained) -> None:
         2: folders[0], 0: folders[1],
     }  # fmt: skip
     assert fits.by_fold[0].subjects == {"bob", "cat"}
-    assert fits.of(0, "ann") is fits.by_fold[0].predictor
+    assert fits.predictor_for(0, "ann") is fits.by_fold[0].predictor
     with pytest.raises(RequestError, match="subject 'bob' is of fold 1, and only the folds 0, 2"):
-        fits.of(1, "bob")
+        fits.predictor_for(1, "bob")
     with pytest.raises(RequestError, match="trained on subject 'cat', who is in that fold"):
-        fits.of(0, "cat")
+        fits.predictor_for(0, "cat")
 
 
 def test_networks_that_do_not_belong_together_are_refused(dataset: Path, trained) -> None:
     first = trained(0)
     other = {
-        "test fold 0, as": trained(0, name="again"),
+        "are both cross_attention for test fold 0": trained(0, name="again"),
         "is 'simple_fusion', .* is 'cross_attention'": trained(1, model="simple_fusion"),
-        "trained on another dataset": trained(1, dataset_sha256="f" * 64),
+        "trained with another dataset": trained(1, dataset_sha256="f" * 64),
     }
     with FaceDataset(dataset) as opened:
         for message, folder in other.items():
@@ -114,9 +114,9 @@ def test_live_says_what_the_network_says_of_the_whole_history(trained, make_trac
     from face_prediction.models.learned import LearnedPredictor
 
     folder = trained(0)
-    name, forecasting, settings = load_forecasting(str(folder), None)
+    name, forecaster, settings = load_forecaster(str(folder), None)
     assert (name, settings) == ("cross_attention", SETTINGS)
-    stream = StreamingPredictor(forecasting, settings)
+    stream = StreamingPredictor(forecaster, settings)
     path = np.array([0.0, 0.0, -0.5]) + 0.001 * np.arange(20)[:, None] * [1.0, -0.5, 0.0]
     landmarks = make_track(path, image_size=SIZE).landmarks
     rng = np.random.default_rng(0)
@@ -136,5 +136,5 @@ def test_live_says_what_the_network_says_of_the_whole_history(trained, make_trac
 
 
 def test_a_network_without_landmarks_cannot_run_live(trained) -> None:
-    with pytest.raises(RequestError, match="image_only: forecasts pictures and no landmarks"):
-        load_forecasting(str(trained(0, model="image_only")), None)
+    with pytest.raises(RequestError, match="image_only: forecasts images and no landmarks"):
+        load_forecaster(str(trained(0, model="image_only")), None)

@@ -14,7 +14,7 @@ import face_prediction.commands.evaluate as command
 from face_prediction.commands.cli import main
 from face_prediction.commands.evaluate import EvaluateOptions, run_evaluate
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.evaluation.setup import Checkpoint
+from face_prediction.evaluation.predictors import FittedPredictor
 from face_prediction.forecast.interface import mouth_centre
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.detector import FaceDetection
@@ -77,7 +77,7 @@ def red_dots(pictures: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Toy:
-    """A network that puts the mouth where the last picture shows it, or where it last was."""
+    """A network that puts the mouth where the last image has it, or where it last was."""
 
     name: str
     test_fold: int
@@ -135,11 +135,15 @@ def toys(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Toy]:
         found[f"blind_{fold}"] = Toy("blind", fold, people[fold])
         found[f"careless_{fold}"] = Toy("careless", fold, people[fold], reads=False)
 
-    def load(folder: Path, dataset_sha256: str) -> Checkpoint:
+    def load(folder: Path, dataset_sha256: str) -> FittedPredictor:
         assert dataset_sha256 == sha256_of(dataset / "dataset.json")
-        return Checkpoint(folder, found[folder.name], "0" * 64)
+        toy = found[folder.name]
+        record = {"name": toy.name, "preset": toy.preset, "test_fold": toy.test_fold}
+        return FittedPredictor(
+            toy, frozenset(toy.train_subjects), folder, {"folder": folder.name, **record}
+        )
 
-    monkeypatch.setattr(command, "load_checkpoint", load)
+    monkeypatch.setattr(command, "load_network", load)
     monkeypatch.setattr(command, "open_detector", lambda model: DotDetector())
     return found
 

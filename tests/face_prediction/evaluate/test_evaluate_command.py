@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tyro
 
+from face_prediction.commands import cli
 from face_prediction.commands.evaluate import EvaluateOptions
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.forecast.interface import mouth_centre
@@ -44,7 +45,7 @@ def test_baselines_alone(dataset: Path, tmp_path: Path, capsys) -> None:
 
 def test_networks_beside_baselines(dataset: Path, tmp_path: Path, toys) -> None:
     names = ("reader_0", "idler_1", "idler_0", "reader_1")
-    record = run(dataset, tmp_path, *names, shuffle_pictures=True)
+    record = run(dataset, tmp_path, *names, shuffle_images=True)
     rows = rows_of(record)
     assert list(rows) == ["persistence", "line", "reader", "idler"]
     assert record["folds"] == [0, 1]
@@ -60,7 +61,7 @@ def test_networks_beside_baselines(dataset: Path, tmp_path: Path, toys) -> None:
     assert numbers["pooled_ssim"]["value"] == pytest.approx(
         rows["persistence"]["numbers"]["pooled_ssim"]["value"], abs=0.02
     )
-    # planted information: who reads the pictures gets worse, who does not is not touched
+    # shuffled images: a network that reads them gets worse, one that does not is not touched
     assert numbers["exchanged"]["value"][0] > 100.0
     assert rows["idler"]["numbers"]["exchanged"] == {
         "value": [0.0] * 3, "low": [0.0] * 3, "high": [0.0] * 3,
@@ -72,7 +73,7 @@ def test_networks_beside_baselines(dataset: Path, tmp_path: Path, toys) -> None:
 
 def test_the_same_command_gives_the_same_bytes(dataset: Path, tmp_path: Path, toys) -> None:
     for name in ("a", "b"):
-        run(dataset, tmp_path / name, "reader_0", max_sequences=5, shuffle_pictures=True)
+        run(dataset, tmp_path / name, "reader_0", max_sequences=5, shuffle_images=True)
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
     record = run(dataset, tmp_path / "c", "reader_0", max_sequences=5, seed=1)
@@ -116,3 +117,15 @@ def test_the_command_line(capsys) -> None:
     assert given == EvaluateOptions(
         Path("d"), (Path("a"), Path("b")), figures=False, max_sequences=9
     )
+
+
+@pytest.mark.parametrize("option", ["--shuffle_images", "--shuffle-images", "--shuffle_pictures"])
+def test_the_old_name_of_the_ablation_works(option: str, monkeypatch) -> None:
+    given = []
+    monkeypatch.setattr(
+        cli,
+        "COMMANDS",
+        tuple((n, o, given.append if n == "evaluate" else r) for n, o, r in cli.COMMANDS),
+    )
+    assert cli.main(["evaluate", "--dataset", "d", option]) == 0
+    assert given[0].shuffle_images

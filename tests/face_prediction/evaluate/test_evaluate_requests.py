@@ -1,4 +1,4 @@
-"""What ``evaluate`` refuses: wrong options, people trained on, other datasets, other pictures."""
+"""Requests that ``evaluate`` refuses: options, people trained on, other datasets and images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 import face_prediction.commands.evaluate as command
 from face_prediction.commands.cli import main
-from face_prediction.evaluation.setup import load_checkpoint
+from face_prediction.evaluation.predictors import load_network
 from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import run
@@ -21,9 +21,13 @@ pytestmark = pytest.mark.long
     ("checkpoints", "options", "message"),
     [
         (("reader_0", "idler_1"), {}, "no fold is covered by all checkpoints"),
-        ((), {"kinds": ("nodding",)}, "--kinds nodding; there are natural, head_motion, grid"),
+        (
+            (),
+            {"kinds": ("nodding",)},
+            "unknown kind of footage 'nodding'.*; valid: grid, head_motion, natural",
+        ),
         ((), {"kinds": ("grid",)}, "no sequence of kind grid"),
-        ((), {"baselines": ("best",)}, "baseline 'best'; there are persistence"),
+        ((), {"baselines": ("best",)}, "unknown baseline 'best'; valid: ar_landmarks, "),
         ((), {"seed": -1}, "--seed -1: 0 or more"),
         ((), {"max_sequences": 1}, "--max_sequences 1: 2 or more"),
         ((), {"detector_model": Path("absent.task")}, "--detector_model absent.task: no such"),
@@ -38,9 +42,11 @@ def test_bad_requests(dataset: Path, tmp_path: Path, toys, checkpoints, options,
 def test_who_was_trained_on_is_not_judged_on(
     dataset: Path, tmp_path: Path, toys, monkeypatch
 ) -> None:
-    monkeypatch.setattr(command, "baselines", None)  # refused before anything takes time
+    monkeypatch.setattr(command, "fit_baselines", None)  # refused before anything takes time
     toys["reader_0"].train_subjects += ("ann", "bob", "cat", "dan", "eve")
-    with pytest.raises(RequestError, match=r"reader: what forecasts fold 0 was trained on subject"):
+    with pytest.raises(
+        RequestError, match=r"reader: the predictor of fold 0 was trained on subject"
+    ):
         run(dataset, tmp_path, "reader_0")
     toys["idler_0"].test_fold = 7
     with pytest.raises(RequestError, match=r"idler is for fold 7; .* has folds 0 to 1"):
@@ -51,13 +57,13 @@ def test_every_single_forecast_is_checked(dataset, tmp_path: Path, toys, monkeyp
     """Even where the check before all others has been forgotten."""
     monkeypatch.setattr(command, "require_unseen", lambda *_: None)
     toys["idler_1"].train_subjects += ("ann", "bob", "cat", "dan", "eve")
-    with pytest.raises(RequestError, match="idler: what forecasts fold 1 was trained on subject"):
+    with pytest.raises(RequestError, match="idler: the predictor of fold 1 was trained on subject"):
         run(dataset, tmp_path, "idler_1", max_sequences=2)
 
 
 def test_a_network_for_other_pictures_is_refused(dataset: Path, tmp_path: Path, toys) -> None:
     toys["reader_0"].size = 256
-    with pytest.raises(RequestError, match="pictures of 256 pixels: this dataset can give 64, 32"):
+    with pytest.raises(RequestError, match="images of 256 pixels: this dataset can give 64, 32"):
         run(dataset, tmp_path, "reader_0")
 
 
@@ -87,4 +93,4 @@ def test_a_checkpoint_of_another_dataset_is_refused(tmp_path: Path, monkeypatch)
     with pytest.raises(
         RequestError, match=r"net: was trained with another dataset .*aaaa, not bbb"
     ):
-        load_checkpoint(Path("net"), "b" * 64)
+        load_network(Path("net"), "b" * 64)

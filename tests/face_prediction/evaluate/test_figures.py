@@ -12,7 +12,12 @@ import pytest
 
 from face_prediction.dataset.clip_file import open_clip, read_array
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.evaluation.video import FORECASTS, PAUSE, clip_story, draw_story
+from face_prediction.evaluation.video import (
+    FORECASTS,
+    PAUSE,
+    forecast_timeline,
+    timeline_images,
+)
 from face_prediction.forecast.interface import mouth_centre
 
 from .conftest import SIZE, red_dots, run
@@ -46,7 +51,7 @@ def test_figures_and_video(dataset: Path, tmp_path: Path, toys) -> None:
     assert frames == 8 + 5 * 4 + 5
 
 
-def test_the_story_of_a_clip_is_told_in_its_own_pixels(dataset: Path) -> None:
+def test_the_timeline_of_a_clip_is_in_its_own_pixels(dataset: Path) -> None:
     with FaceDataset(dataset) as opened:
         indices = [i for i in range(len(opened)) if opened.entry(i).clip == "two"]
         path = dataset / "clips" / "two.h5"
@@ -54,21 +59,23 @@ def test_the_story_of_a_clip_is_told_in_its_own_pixels(dataset: Path) -> None:
             landmarks = read_array(path, file, "frames/landmarks")
         true = mouth_centre(landmarks) * SIZE
         exact, off = np.zeros((len(indices), 5, 2)), np.array([0.1, -0.2])
-        story = clip_story(opened, indices, [("exact", exact), ("off", exact + off)])
-    np.testing.assert_allclose(story.mouth, true[story.frames], atol=1e-3)
-    assert story.frames.tolist() == list(range(33))
-    assert story.origins.tolist() == [7, 11, 15, 19, 23, 27]
-    forecasts = story.forecasts[0][1]
-    for origin, ahead in zip(story.origins, forecasts, strict=True):
+        timeline = forecast_timeline(opened, indices, [("exact", exact), ("off", exact + off)])
+    np.testing.assert_allclose(timeline.mouth, true[timeline.frames], atol=1e-3)
+    assert timeline.frames.tolist() == list(range(33))
+    assert timeline.origins.tolist() == [7, 11, 15, 19, 23, 27]
+    forecasts = timeline.forecasts[0][1]
+    for origin, ahead in zip(timeline.origins, forecasts, strict=True):
         np.testing.assert_allclose(ahead, true[origin + 1 : origin + 6], atol=1e-3)
-    for crop, apart in zip(story.crops[7::4], story.forecasts[1][1] - forecasts, strict=False):
+    for crop, apart in zip(
+        timeline.crops[7::4], timeline.forecasts[1][1] - forecasts, strict=False
+    ):
         np.testing.assert_allclose(apart, np.tile(crop.side * off, (5, 1)))
-    # and the pictures lie where they were cut: the dot is at the mouth
-    for frame, picture, crop in zip(story.frames, story.pictures, story.crops, strict=True):
-        dot = red_dots(picture) * crop.side + (crop.left, crop.top)
+    # and the images lie where they were cut: the dot is at the mouth
+    for frame, image, crop in zip(timeline.frames, timeline.images, timeline.crops, strict=True):
+        dot = red_dots(image) * crop.side + (crop.left, crop.top)
         np.testing.assert_allclose(dot, true[frame], atol=1.5)
-    story = replace(story, forecasts=story.forecasts[:1])
-    images = list(draw_story(story))
+    timeline = replace(timeline, forecasts=timeline.forecasts[:1])
+    images = list(timeline_images(timeline))
     assert [image.shape for image in images] == [(560, 1280, 3)] * 33
     # a forecast appears in the plots at the frame it is made at, not before; the truth then comes
     # to lie on it, since this one is exact
@@ -76,6 +83,6 @@ def test_the_story_of_a_clip_is_told_in_its_own_pixels(dataset: Path) -> None:
     assert orange[0] == orange[6] < orange[8] < orange[7]
     assert orange[-1] == orange[0]
     # and where there is time, the video stops at each
-    sparse = [(name, forecast[::2]) for name, forecast in story.forecasts]
-    slow = replace(story, origins=story.origins[::2], forecasts=sparse)
-    assert sum(1 for _ in draw_story(slow)) == 33 + 3 * PAUSE
+    sparse = [(name, forecast[::2]) for name, forecast in timeline.forecasts]
+    slow = replace(timeline, origins=timeline.origins[::2], forecasts=sparse)
+    assert sum(1 for _ in timeline_images(slow)) == 33 + 3 * PAUSE

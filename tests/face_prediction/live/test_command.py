@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,7 @@ import pytest
 
 from face_prediction.commands import live as live_command
 from face_prediction.commands.live import LiveOptions, run_live
-from face_prediction.live import sinks
-from face_prediction.live.sinks import Window
+from face_prediction.live import display
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -32,12 +32,6 @@ class DrawnFaces:
         self.landmarks = landmarks
         self.count = -1
 
-    def __enter__(self) -> DrawnFaces:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
     def find(self, image: np.ndarray, time: float) -> np.ndarray | None:
         self.count += 1
         if self.count == self.interrupt_at:
@@ -50,7 +44,7 @@ class DrawnFaces:
 @pytest.fixture
 def faces(monkeypatch, landmarks) -> DrawnFaces:
     drawn = DrawnFaces(landmarks)
-    monkeypatch.setattr(live_command, "FaceFinder", lambda model: drawn)
+    monkeypatch.setattr(live_command, "face_finder", lambda model: nullcontext(drawn.find))
     monkeypatch.setattr(live_command, "find_model", lambda given: given)
     return drawn
 
@@ -87,7 +81,7 @@ def test_a_lost_face_is_said(clip: Path, faces, tmp_path: Path, monkeypatch, cap
     def note(image, lines) -> None:
         told.append([text for text, _ in lines])
 
-    monkeypatch.setattr("face_prediction.live.loop.draw_lines", note)
+    monkeypatch.setattr("face_prediction.live.loop.draw_text", note)
     faces.hidden = (8, 9, 10, 11)
     out = tmp_path / "out.mp4"
     assert run_live(LiveOptions(video=clip, checkpoint="persistence", out=out)) == 0
@@ -159,8 +153,8 @@ def test_without_a_screen_a_file_must_be_named(clip: Path, faces, monkeypatch) -
     with pytest.raises(RequestError, match=r"opens no window.*--out"):
         run_live(LiveOptions(video=clip, checkpoint="line"))
     monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GUI:                   QT5\n")
-    monkeypatch.setattr(sinks.sys, "platform", "linux")
+    monkeypatch.setattr(display.sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(RequestError, match=r"no screen .* --out"):
-        Window()
+    with pytest.raises(RequestError, match=r"no screen .* --out"), display.window_sink():
+        pass

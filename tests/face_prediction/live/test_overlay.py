@@ -1,12 +1,12 @@
-"""What is drawn over a frame, and how its times are counted."""
+"""Drawing over a frame, and the times of each stage."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from face_prediction.live.loop import Summary, Times, captions, run_loop
-from face_prediction.live.sinks import FAR, GREEN, NEAR, draw_lines, draw_mouth
+from face_prediction.live.display import FAR, GREEN, NEAR, draw_mouth, draw_text
+from face_prediction.live.loop import LiveStatistics, captions, run_loop
 from face_prediction.live.streaming import LiveForecast
 from face_prediction.tracking.crop import Crop
 from face_prediction.tracking.video import VideoFrame
@@ -45,24 +45,23 @@ def test_a_mouth_at_the_edge_is_no_trouble(landmarks) -> None:
 @pytest.mark.parametrize("shape", [(1080, 1920), (240, 320), (1280, 720), (120, 160)])
 def test_text_fits_its_image(shape: tuple[int, int]) -> None:
     image = np.full((*shape, 3), 200, dtype=np.uint8)
-    draw_lines(image, [("residual: mouth now (green) and in 1 to 5 frames", GREEN)] * 4)
+    draw_text(image, [("residual: mouth now (green) and in 1 to 5 frames", GREEN)] * 4)
     touched = np.flatnonzero((image != 200).any(axis=(0, 2)))
     assert touched.max() <= shape[1] - 1
     ink = np.flatnonzero((image[..., 1] > 200).any(axis=0))
     assert ink.max() < shape[1] - 2  # the last letter is whole
     empty = np.full((8, 8, 3), 200, dtype=np.uint8)
-    draw_lines(empty, [])
+    draw_text(empty, [])
     assert (empty == 200).all()
 
 
 def test_times_are_of_the_last_second_or_so() -> None:
-    times = Times()
-    times.seconds["detector"] += [1.0] * 50 + [0.02] * 30
-    assert times.recent("detector") == pytest.approx(0.02)
-    assert np.isnan(times.recent("predictor"))
-    assert "| detector | 80 | 632.5 | 1000.0 | 1.6 |" in times.table()
-    assert "predictor" not in times.table()
-    assert captions(times, None, "line", 70)[0][0] == "detector 20.0 ms, 50 a second"
+    statistics = LiveStatistics()
+    statistics.seconds["detector"] += [1.0] * 50 + [0.02] * 30
+    assert "| detector | 80 | 632.5 | 1000.0 | 1.6 |" in statistics.times_table()
+    assert "predictor" not in statistics.times_table()
+    lines = [text for text, _ in captions(statistics, None, "line", 70)]
+    assert lines == ["detector 20.0 ms, 50 a second", "face lost"]
 
 
 def test_each_stage_is_timed_on_its_own(landmarks) -> None:
@@ -73,24 +72,20 @@ def test_each_stage_is_timed_on_its_own(landmarks) -> None:
             ahead = np.repeat(landmarks[None, :, :2], 5, axis=0)
             return LiveForecast(ahead, Crop(0, 0, 100), False, 70)
 
-    class Nowhere:
-        def show(self, image, time) -> bool:
-            return True
-
     frames = [VideoFrame(i / 30, np.zeros((240, 320, 3), dtype=np.uint8)) for i in range(3)]
-    summary = Summary()
+    statistics = LiveStatistics()
     run_loop(
         frames,
         lambda image, time: landmarks,
         Fixed(),  # pyright: ignore[reportArgumentType]
-        Nowhere(),
+        lambda image, time: True,
         "fixed",
         70,
-        summary,
+        statistics,
         clock=lambda: float(next(now)),
     )
-    seconds = summary.times.seconds
+    seconds = statistics.seconds
     assert seconds["detector"] == pytest.approx([0.010] * 3)
     assert seconds["predictor"] == pytest.approx([0.004] * 3)
     assert seconds["whole"] == pytest.approx([0.015] * 3)
-    assert (summary.frames, summary.faces, summary.crops) == (3, 3, 0)
+    assert (statistics.frames, statistics.faces, statistics.crops) == (3, 3, 0)

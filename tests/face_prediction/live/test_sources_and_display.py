@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.live import sinks, sources
-from face_prediction.live.sinks import VideoFile, Window
-from face_prediction.live.sources import camera_frames, video_frames
+from face_prediction.live import sources
+from face_prediction.live.display import video_sink, window_sink
+from face_prediction.live.sources import camera_frames, live_frames
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -31,7 +31,8 @@ def read(path: Path) -> list[VideoFrame]:
 )
 def test_a_window_ends_with_escape_q_or_its_button(monkeypatch, key, is_open, goes_on) -> None:
     shown: list[np.ndarray] = []
-    monkeypatch.setattr(sinks, "window_problem", lambda: None)
+    monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GUI:                   QT5\n")
+    monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(cv2, "namedWindow", lambda *_: None)
     monkeypatch.setattr(cv2, "destroyAllWindows", lambda: shown.clear())
     monkeypatch.setattr(cv2, "imshow", lambda _, image: shown.append(image))
@@ -39,8 +40,8 @@ def test_a_window_ends_with_escape_q_or_its_button(monkeypatch, key, is_open, go
     monkeypatch.setattr(cv2, "getWindowProperty", lambda *_: is_open)
     image = np.zeros((4, 4, 3), dtype=np.uint8)
     image[..., 0] = 200
-    with Window() as window:
-        assert window.show(image, 0.0) == goes_on
+    with window_sink() as show:
+        assert show(image, 0.0) == goes_on
         assert shown[0][0, 0].tolist() == [0, 0, 200]  # OpenCV's order
     assert shown == []
 
@@ -107,15 +108,15 @@ def test_no_such_camera() -> None:
 
 
 def test_a_video_gives_every_frame(clip: Path) -> None:
-    assert [frame.time for frame in video_frames(clip)] == pytest.approx(np.arange(20) / 30)
+    assert [frame.time for frame in live_frames(clip, None)] == pytest.approx(np.arange(20) / 30)
 
 
 def test_a_file_keeps_the_times_of_its_images(tmp_path: Path) -> None:
     times = [0.0, 0.04, 0.05, 0.5, 0.51]
     path = tmp_path / "new" / "odd.mp4"
-    with VideoFile(path, 25.0) as file:
+    with video_sink(path, 25.0) as show:
         for index, time in enumerate(times):
-            assert file.show(np.full((33, 47, 3), 40 * index, dtype=np.uint8), time)
+            assert show(np.full((33, 47, 3), 40 * index, dtype=np.uint8), time)
     frames = read(path)
     assert [frame.time for frame in frames] == pytest.approx(times, abs=1e-4)
     assert frames[0].image.shape == (32, 46, 3)
@@ -125,6 +126,6 @@ def test_a_file_keeps_the_times_of_its_images(tmp_path: Path) -> None:
 
 
 def test_a_file_without_images_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RequestError, match="no image to write"), VideoFile(tmp_path / "a.mp4", 30):
+    with pytest.raises(RequestError, match="no image to write"), video_sink(tmp_path / "a.mp4", 30):
         pass
     assert list(tmp_path.iterdir()) == []

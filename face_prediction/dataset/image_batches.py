@@ -1,0 +1,103 @@
+"""Landmarks and images of some sequences at once, each image decoded once for all predictors.
+
+Legend: B sequences, T frames of history, H horizon, L = 468 landmarks, P images, S their side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from face_prediction.dataset.clip_file import REDUCTIONS
+from face_prediction.dataset.reader import FaceDataset
+from face_prediction.prediction.interface import PictureNeeds
+from robo_manip_baselines.runs.errors import RequestError
+
+
+@dataclass(frozen=True)
+class ImagePlan:
+    """Images to decode.
+
+    Attributes:
+        history: for each side S, the number of frames at the end of the history.
+        future: sides at which the frames to be forecast are decoded, too.
+    """
+
+    history: Mapping[int, int]
+    future: frozenset[int]
+
+    @classmethod
+    def of(cls, needs: Iterable[PictureNeeds], future: Iterable[int] = ()) -> ImagePlan:
+        """The plan that serves all ``needs``, with the future at the sides ``future``."""
+        history: dict[int, int] = {}
+        for need in needs:
+            if need.frames:
+                history[need.size] = max(need.frames, history.get(need.size, 0))
+        return cls(history, frozenset(future))
+
+
+class SequenceBatch:
+    """Landmarks and images of B sequences.
+
+    Args:
+        dataset: the open dataset.
+        indices: (B,) sequences.
+        plan: images to decode.
+        images_of: (B,) sequences whose images stand in for their own (shuffled-image ablation).
+
+    Attributes:
+        history: (B, T, L, 2) float32 landmarks.
+        future: (B, H, L, 2) float32 landmarks.
+    """
+
+    def __init__(
+        self,
+        dataset: FaceDataset,
+        indices: Sequence[int],
+        plan: ImagePlan,
+        images_of: Sequence[int] | None = None,
+    ) -> None:
+        settings = dataset.manifest.settings
+        frames = np.stack([dataset.landmarks(index)[..., :2] for index in indices])
+        self.history: NDArray[np.float32] = frames[:, : settings.history]
+        self.future: NDArray[np.float32] = frames[:, settings.history :]
+        self._past: dict[int, NDArray[np.uint8]] = {}
+        self._future: dict[int, NDArray[np.uint8]] = {}
+        sources = indices if images_of is None else images_of
+        for size in sorted({*plan.history, *plan.future}):
+            past = plan.history.get(size, 0)
+            stop = settings.length if size in plan.future else settings.history
+            wanted = slice(settings.history - past, stop)
+            reduce = reduction(settings.crop_size, size)
+            images = np.stack([dataset.pictures(index, wanted, reduce) for index in sources])
+            self._past[size], self._future[size] = images[:, :past], images[:, past:]
+
+    def images(self, needs: PictureNeeds) -> NDArray[np.uint8] | None:
+        """Images (B, P, S, S, 3) of the last P frames of the history; None for P = 0."""
+        if not needs.frames:
+            return None
+        past = self._past[needs.size]
+        return past[:, past.shape[1] - needs.frames :]
+
+    def future_images(self, size: int) -> NDArray[np.uint8]:
+        """Images (B, H, S, S, 3) of the frames to be forecast."""
+        return self._future[size]
+
+
+def reduction(crop_size: int, size: int) -> int:
+    """The factor that reduces images of side ``crop_size`` to side ``size``.
+
+    Raises:
+        RequestError: there is none.
+    """
+    for reduce in REDUCTIONS:
+        if size * reduce == crop_size:
+            return reduce
+    sizes = ", ".join(str(crop_size // reduce) for reduce in REDUCTIONS)
+    raise RequestError(
+        f"images of {size} pixels: this dataset can give {sizes}; "
+        "use one with images of the size that the network was trained with"
+    )
