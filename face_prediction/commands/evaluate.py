@@ -14,7 +14,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.settings import KINDS
+from face_prediction.dataset.sequences import KINDS
 from face_prediction.evaluation.scoring import Verdict, judge, judge_exchanged, steps
 from face_prediction.evaluation.setup import (
     LineUp,
@@ -35,8 +35,8 @@ from face_prediction.evaluation.tables import Evaluation, table_1, write_results
 from face_prediction.evaluation.video import draw_pictures, draw_plots, draw_video
 from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
-from face_prediction.tracking.video import sha256_of
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
     with ExitStack() as stack:
         dataset = stack.enter_context(FaceDataset(options.dataset))
         stack.enter_context(logging_redirect_tqdm())
-        dataset_sha256 = sha256_of(options.dataset / MANIFEST_NAME)
+        dataset_sha256 = file_digest(options.dataset / MANIFEST_NAME)
         checkpoints = [load_checkpoint(path, dataset_sha256) for path in options.checkpoints]
         trained = networks([(item.folder, item.predictor) for item in checkpoints])
         require_unseen(dataset, trained)

@@ -27,6 +27,8 @@ class ExportMotionOptions:
     Only clips whose row says ship=yes are taken. Without --attribution every clip is taken, each
     as a subject of its own, and its licence is recorded as not stated.
 
+    Example: face-prediction export-motion face_tracks --attribution clips.csv --out motion.npz
+
     Attributes:
         tracks: Folders of tracks, or single tracks.
         out: The library to write.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from face_prediction.dataset.clip_file import reduction
 from face_prediction.dataset.manifest import SequenceRow
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation import (
@@ -27,7 +28,6 @@ from face_prediction.evaluation import (
     mouth_residuals,
     save_error_stats,
 )
-from face_prediction.evaluation.batches import reduction
 from face_prediction.evaluation.library_errors import (
     camera_with_crop,
     crop_spans,
@@ -35,7 +35,7 @@ from face_prediction.evaluation.library_errors import (
     shortened,
 )
 from face_prediction.evaluation.setup import CrossFit, batch_size, cross_fit
-from face_prediction.motion.library import load_library
+from face_prediction.motion.library import load_motion
 from face_prediction.prediction.interface import PictureNeeds
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
@@ -186,7 +186,7 @@ def of_library(dataset: FaceDataset, options: ExportStatsOptions, path: Path) ->
     """
     if options.checkpoints or options.baseline is not None:
         raise RequestError("--library: holds forecasts; leave --checkpoints and --baseline out")
-    library = load_library(path)
+    library = load_motion(path)
     kinds = {clip.clip: clip.kind for clip in dataset.manifest.clips if clip.sequences}
     strange = sorted(set(library.run_clip.tolist()) - set(kinds))
     if strange:

@@ -50,6 +50,9 @@ class ExportSurfaceOptions:
     Only clips whose row says ship=yes are taken; without --attribution every clip is taken, each
     as a subject of its own.
 
+    Example: face-prediction export-surface face_tracks --attribution clips.csv
+    --out face_surface.npz
+
     Attributes:
         tracks: Folders of tracks, or single tracks.
         out: The surface to write.

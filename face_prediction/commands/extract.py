@@ -27,6 +27,8 @@ class ExtractOptions:
     A track that is already there, of the same video with the same settings, is kept: a run that
     was killed carries on when started again.
 
+    Example: face-prediction extract clips/*.mp4 --model face_landmarker.task --out face_tracks
+
     Attributes:
         videos: Video files, of any kind that PyAV (FFmpeg) opens.
         out: Folder for the tracks.

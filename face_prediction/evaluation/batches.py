@@ -12,12 +12,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.clip_file import REDUCTIONS
+from face_prediction.dataset.clip_file import reduction
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.prediction.interface import Forecast, PictureNeeds, Predictor
 from face_prediction.tracking.detector import FaceDetection
 from face_prediction.tracking.tracks import NUM_LANDMARKS
-from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)
@@ -87,22 +86,6 @@ class Batch:
     def coming(self, size: int) -> NDArray[np.uint8]:
         """Pictures (B, H, S, S, 3) of the frames to be forecast."""
         return self._coming[size]
-
-
-def reduction(crop_size: int, size: int) -> int:
-    """What pictures of side ``crop_size`` are reduced by to be of side ``size``.
-
-    Raises:
-        RequestError: they cannot be.
-    """
-    for reduce in REDUCTIONS:
-        if size * reduce == crop_size:
-            return reduce
-    sizes = ", ".join(str(crop_size // reduce) for reduce in REDUCTIONS)
-    raise RequestError(
-        f"pictures of {size} pixels: this dataset can give {sizes}; "
-        "use one with pictures of the size that the network was trained with"
-    )
 
 
 #: Pictures are enlarged to at least this side (pixels), the one that the detector's second network

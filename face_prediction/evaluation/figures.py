@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from face_prediction.evaluation.calibration import LEVELS
 from face_prediction.evaluation.statistics import KindSummary
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 

@@ -14,8 +14,8 @@ from face_prediction.dataset.manifest import CLIP_FOLDER
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation import Camera, ErrorStats
 from face_prediction.evaluation.error_stats import ResidualRun
-from face_prediction.motion.library import MotionLibrary
-from face_prediction.tracking.lifting import VERTICAL_FOV_DEGREES
+from face_prediction.motion.library import RecordedMotion
+from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -70,7 +70,7 @@ class LibraryResiduals:
     starts: tuple[int, ...]
 
 
-def library_residuals(library: MotionLibrary, clips: Collection[str]) -> LibraryResiduals:
+def library_residuals(library: RecordedMotion, clips: Collection[str]) -> LibraryResiduals:
     """Errors of every forecast in the runs of ``clips`` whose H frames the run holds.
 
     Raises:

@@ -27,8 +27,8 @@ from face_prediction.evaluation.batches import (
 )
 from face_prediction.forecast import FORECASTERS, Forecaster, LandmarkSequences, fit_forecaster
 from face_prediction.prediction.interface import Forecast, PictureNeeds, Predictor
-from face_prediction.tracking.video import sha256_of
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def load_networks(dataset: FaceDataset, folders: Sequence[Path]) -> CrossFit:
     """
     from face_prediction.models.learned import LearnedPredictor  # PyTorch only where it is needed
 
-    data = sha256_of(dataset.folder / MANIFEST_NAME)
+    data = file_digest(dataset.folder / MANIFEST_NAME)
     by_fold: dict[int, Fitted] = {}
     names: list[str] = []
     for folder in folders:
@@ -568,7 +568,7 @@ def load_checkpoint(folder: Path, dataset_sha256: str) -> Checkpoint:
             f"{trained_with[:12]}, not {dataset_sha256[:12]}), whose folds are of other people; "
             "give that one, or train again"
         )
-    return Checkpoint(folder, predictor, sha256_of(folder / WEIGHTS_NAME))
+    return Checkpoint(folder, predictor, file_digest(folder / WEIGHTS_NAME))
 
 
 def provenance(

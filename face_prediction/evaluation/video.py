@@ -31,7 +31,7 @@ from face_prediction.evaluation.scoring import Verdict, forecast_of
 from face_prediction.evaluation.setup import PERSISTENCE, LineUp
 from face_prediction.evaluation.statistics import KindSummary
 from face_prediction.forecast.interface import mouth_centre
-from face_prediction.tracking.crop import Crop
+from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.runs.files import atomic_file
 
 

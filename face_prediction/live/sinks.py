@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.forecast import mouth_centre
-from face_prediction.tracking.crop import Crop
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS, Crop
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 

@@ -27,7 +27,6 @@ from face_prediction.models.checkpoint import (
 )
 from face_prediction.models.interface import PredictorModel
 from face_prediction.models.settings import TrainSettings, make_model
-from face_prediction.tracking.video import sha256_of
 from face_prediction.training.metrics import METRICS_FILE, draw_curves
 from face_prediction.training.options import People, TrainOptions, choose_people
 from face_prediction.training.seeds import torch_seed
@@ -43,6 +42,7 @@ from face_prediction.training.trainer import Pace, Trainer, run_record
 from face_prediction.training.validation import Validation
 from face_prediction.training.windows import Sampler, Windows
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 from robo_manip_baselines.runs.interrupt import StopRequest
 
 
@@ -128,7 +128,7 @@ def train(options: TrainOptions) -> int:
             training=settings.to_json(),
             seed=options.seed,
             dataset=dataset.manifest.settings.to_json(),
-            dataset_sha256=sha256_of(options.dataset / MANIFEST_NAME),
+            dataset_sha256=file_digest(options.dataset / MANIFEST_NAME),
             folds=people.folds,
             train_subjects=people.train_subjects,
             step=0,

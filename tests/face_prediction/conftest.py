@@ -12,8 +12,7 @@ import av
 import numpy as np
 import pytest
 
-from face_prediction.tracking.geometry import rigid_face
-from face_prediction.tracking.lifting import CANONICAL_MOUTH, LIPS
+from face_prediction.tracking.geometry import CANONICAL_MOUTH, LIPS, rigid_face
 from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack
 
 

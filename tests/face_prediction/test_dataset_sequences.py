@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.dataset.manifest import FACTS, largest_angle, sequence_facts
-from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.dataset.manifest import FACTS, largest_angle, sequence_statistics
+from face_prediction.dataset.sequences import SequenceSettings, clip_frames, find_sequences
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
 SETTINGS = SequenceSettings(history=8, future=2, stride=5)
@@ -132,7 +131,9 @@ def test_facts_of_a_motion_that_is_known(make_track) -> None:
     marked = np.zeros(frames, dtype=bool)
     marked[:3] = True
     clip, sequences = cut(replace(track, interpolated=marked))
-    facts = {name: column[0] for name, column in sequence_facts(clip, sequences, SETTINGS).items()}
+    facts = {
+        name: column[0] for name, column in sequence_statistics(clip, sequences, SETTINGS).items()
+    }
     assert set(facts) == {fact.name for fact in FACTS}
     # micrometres: landmarks are kept in single precision
     assert facts["mouth_range_x"] == pytest.approx(0.018, abs=2e-5)
@@ -155,10 +156,10 @@ def test_a_face_that_leaves_the_crop_is_counted(make_track, axis, step) -> None:
     mouth[8, axis], mouth[9, axis] = step, 2 * step
     tight = replace(SETTINGS, margin=0.0)
     clip, sequences = cut(make_track(mouth), tight)
-    assert sequence_facts(clip, sequences, tight)["outside_share"].tolist() == [1.0]
+    assert sequence_statistics(clip, sequences, tight)["outside_share"].tolist() == [1.0]
     wide = replace(SETTINGS, margin=0.5)
     clip, sequences = cut(make_track(mouth), wide)
-    assert sequence_facts(clip, sequences, wide)["outside_share"].tolist() == [0.0]
+    assert sequence_statistics(clip, sequences, wide)["outside_share"].tolist() == [0.0]
 
 
 def test_largest_angle_is_between_any_two() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from face_prediction.dataset.manifest import Amount, assign_folds, fold_split
-from face_prediction.dataset.settings import kind_of
+from face_prediction.dataset.sequences import kind_of
 from face_prediction.motion.library import Attribution, read_attributions
 from robo_manip_baselines.runs.errors import RequestError
 

@@ -14,7 +14,7 @@ from face_prediction.evaluation.batches import DETECTOR_SIDE, DetectedPredictor,
 from face_prediction.evaluation.calibration import LEVELS, covered, interval_levels
 from face_prediction.evaluation.errors import area_average, similarities
 from face_prediction.evaluation.setup import BaselinePredictor
-from face_prediction.forecast.simple import ConstantVelocity, Persistence
+from face_prediction.forecast.extrapolation import ConstantVelocity, Persistence
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.detector import FaceDetection
 from robo_manip_baselines.runs.errors import RequestError

@@ -18,9 +18,9 @@ from face_prediction.forecast.autoregression import (
     spectral_radius,
     stabilised,
 )
+from face_prediction.forecast.extrapolation import ConstantVelocity, LineFit, Persistence
 from face_prediction.forecast.interface import subject_folds
-from face_prediction.forecast.simple import ConstantVelocity, Line, Persistence
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
 FACE = np.random.default_rng(5).uniform(0.2, 0.8, (468, 2))
@@ -68,7 +68,7 @@ def test_persistence_repeats_the_last_frame() -> None:
 
 
 @pytest.mark.parametrize(
-    "method", [ConstantVelocity(), ConstantVelocity(window=4), Line(), Line(frames=8)]
+    "method", [ConstantVelocity(), ConstantVelocity(window=4), LineFit(), LineFit(frames=8)]
 )
 @pytest.mark.parametrize("frames", [2, 3, 12])
 def test_uniform_motion_is_forecast_exactly(method: ConstantVelocity | Line, frames: int) -> None:
@@ -87,7 +87,7 @@ def test_line_is_that_of_polyfit() -> None:
     history = FACE + np.random.default_rng(7).normal(0, 0.01, (9, 468, 2))
     slope, level = np.polyfit(np.arange(5), history[-5:].reshape(5, -1), 1)
     expected = level + np.arange(5, 10)[:, None] * slope
-    np.testing.assert_allclose(Line().predict(history, 5), expected.reshape(5, 468, 2))
+    np.testing.assert_allclose(LineFit().predict(history, 5), expected.reshape(5, 468, 2))
 
 
 @pytest.mark.parametrize(("kind", "value"), [(ConstantVelocity, 0), (Line, 1)])

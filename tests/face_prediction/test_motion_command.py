@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.cli import main
-from face_prediction.motion.library import load_library
+from face_prediction.motion.library import load_motion
 from face_prediction.motion.report import BEGIN, END
 from face_prediction.tracking.tracks import save_track
 
@@ -52,7 +52,7 @@ def run(folder: Path, caplog):
 
 def test_only_clips_that_may_ship_are_in_the_library(folder: Path, run) -> None:
     assert run("--attribution", folder / "clips.csv") == 0
-    library = load_library(folder / "motion.npz")
+    library = load_motion(folder / "motion.npz")
     assert library.run_clip.tolist() == ["lively", "lively", "steady"]
     assert library.run_subject.tolist() == ["bob", "bob", "ann"]
     assert library.run_length.tolist() == [100, 99, 100]
@@ -78,7 +78,7 @@ def test_the_same_tracks_give_the_same_file(folder: Path, run) -> None:
 
 def test_without_a_table_nothing_is_claimed(folder: Path, run) -> None:
     assert run() == 0
-    attribution = load_library(folder / "motion.npz").metadata["attribution"]
+    attribution = load_motion(folder / "motion.npz").metadata["attribution"]
     assert {row["licence"] for row in attribution.values()} == {"not stated"}
 
 

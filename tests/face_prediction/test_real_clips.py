@@ -11,11 +11,13 @@ from face_prediction.commands.cli import main
 from face_prediction.motion.motion import step_tremor
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector
 from face_prediction.tracking.geometry import (
+    CANONICAL_MOUTH,
+    LIPS,
     head_pose_from_landmarks,
+    mouth_centres,
     read_canonical_face,
     rigid_face,
 )
-from face_prediction.tracking.lifting import CANONICAL_MOUTH, LIPS, mouth_centres
 from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import VideoReader
 

@@ -16,7 +16,7 @@ from face_prediction.models.interface import Future, History, Losses, Output, Pr
 from face_prediction.models.residual.prior import AdaptivePrior, PriorForecast
 from face_prediction.models.residual.settings import ResidualSettings
 from face_prediction.prediction.interface import PictureNeeds
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 
 #: Corners of the eyes in MediaPipe's face mesh: outer and inner, the subject's right and left.
 _RIGHT_EYE = (33, 133)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.cli import main
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import FaceTrack, save_track
-from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.files import file_digest
 
 SIZE = (320, 240)
 TABLE = """clip,subject,ship,licence,source,what
@@ -62,6 +62,6 @@ def folder(tmp_path: Path, make_track, write_video, caplog) -> Folder:
         mouth[:, 1] = 0.01 * np.cos(np.arange(frames) / 5)
         track = make_track(mouth, image_size=SIZE, name=f"{name}.mp4")
         video = write_video(tmp_path / "videos" / f"{name}.mp4", draw(track))
-        source = {"name": video.name, "sha256": sha256_of(video)}
+        source = {"name": video.name, "sha256": file_digest(video)}
         save_track(tmp_path / "tracks" / f"{name}.npz", replace(track, source=source))
     return Folder(tmp_path)

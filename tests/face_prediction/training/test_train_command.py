@@ -17,7 +17,7 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation import mouth_distances, mouth_residuals
 from face_prediction.models.checkpoint import read_checkpoint, read_tensors
 from face_prediction.models.learned import LearnedPredictor
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.training.metrics import read_metrics
 from face_prediction.training.setup import locked
 from face_prediction.training.step import TrainStep
