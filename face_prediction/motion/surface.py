@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-
 from face_prediction.tracking.geometry import (
     LOWER_INNER_LIP,
     UPPER_INNER_LIP,
@@ -163,6 +161,8 @@ def closed_mean(aligned: Sequence[np.ndarray], velocity: np.ndarray) -> np.ndarr
 
 def mirror_partners(vertices: np.ndarray) -> np.ndarray:
     """For every vertex (V,) the one on the other side of the face; itself on the midline."""
+    from scipy.optimize import linear_sum_assignment  # slow to import
+
     mirrored = vertices * (-1, 1, 1)
     distance = ((vertices[:, None] - mirrored) ** 2).sum(axis=-1)
     partner = linear_sum_assignment(distance + distance.T)[1]

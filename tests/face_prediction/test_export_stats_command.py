@@ -331,10 +331,15 @@ def test_a_library_is_measured_frame_by_frame(dataset: Path, tmp_path: Path) -> 
     ],
 )
 def test_a_library_that_cannot_be_measured_is_refused(
-    dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], words: str
+    dataset: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    exit_code: Callable[[list[str]], int],
+    options: list[str],
+    words: str,
 ) -> None:
     library, out = predicted_library(tmp_path), tmp_path / "stats.json"
     command = ["export-stats", "--dataset", str(dataset), "--library", str(library)]
-    assert main([*command, "--out", str(out), *options]) == 2
+    assert exit_code([*command, "--out", str(out), *options]) == 2
     assert words in caplog.text
     assert not out.exists()

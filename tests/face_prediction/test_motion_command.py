@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.commands.cli import main
 from face_prediction.motion.library import load_motion
 from face_prediction.motion.report import BEGIN, END
 from face_prediction.tracking.tracks import save_track
@@ -40,12 +39,12 @@ def folder(tmp_path: Path, make_track) -> Path:
 
 
 @pytest.fixture
-def run(folder: Path, caplog):
+def run(folder: Path, caplog, exit_code):
     caplog.set_level(logging.INFO)
 
     def export(*arguments: object, tracks: Path | None = None) -> int:
         words = ["export-motion", str(tracks or folder / "tracks"), *map(str, arguments)]
-        return main([*words, "--out", str(folder / "motion.npz"), "--min_run", "1"])
+        return exit_code([*words, "--out", str(folder / "motion.npz"), "--min_run", "1"])
 
     return export
 
@@ -113,10 +112,10 @@ def test_the_report(folder: Path, run) -> None:
         (("--min_run", "100"), "no run is long enough"),
     ],
 )
-def test_bad_requests(folder: Path, caplog, arguments, message) -> None:
+def test_bad_requests(folder: Path, caplog, exit_code, arguments, message) -> None:
     caplog.set_level(logging.INFO)
     words = ["export-motion", str(folder / "tracks"), "--out", str(folder / "m.npz"), *arguments]
-    assert main(words) == 2
+    assert exit_code(words) == 2
     assert message in caplog.text
     assert len(caplog.messages) == 1
     assert not (folder / "m.npz").exists()

@@ -120,9 +120,9 @@ def test_our_pose_is_mediapipes(clips: Path, model: Path) -> None:
             np.testing.assert_allclose(pose, found.head_pose, atol=2e-5)
 
 
-def test_a_model_of_another_kind_is_refused(clips: Path, tmp_path: Path, caplog) -> None:
+def test_a_model_of_another_kind_is_refused(clips: Path, tmp_path: Path, caplog, exit_code) -> None:
     path = tmp_path / "face_landmarker.task"
     path.write_bytes(b"no model")
     words = ["extract", str(clips / "carphone.mp4"), "--model", str(path), "--out", str(tmp_path)]
-    assert main(words) == 2
+    assert exit_code(words) == 2
     assert "cannot load it as a face landmarker model" in caplog.text
