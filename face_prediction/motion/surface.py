@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from face_prediction.tracking.geometry import (
     LOWER_INNER_LIP,
     UPPER_INNER_LIP,

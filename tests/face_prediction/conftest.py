@@ -151,5 +151,7 @@ def exit_code() -> Callable[[Sequence[str]], int]:
         except RequestError as error:
             logging.getLogger(__name__).error("%s", error)
             return 2
+        except KeyboardInterrupt:
+            return 130
 
     return run

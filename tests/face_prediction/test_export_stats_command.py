@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -256,7 +257,7 @@ def test_what_cannot_be_done_is_refused(options, change, message: str) -> None:
 def test_a_picture_size_that_the_dataset_has_not_is_refused(options, monkeypatch) -> None:
     watched = Watched(needs=PictureNeeds(1, 48))
     use(monkeypatch, CrossFit("watched", dict.fromkeys(range(3), Fitted(watched, frozenset()))))
-    with pytest.raises(RequestError, match="pictures of 48 pixels: this dataset can give 64, 32, "):
+    with pytest.raises(RequestError, match="images of 48 pixels: this dataset can give 64, 32, "):
         run_export_stats(options)
 
 

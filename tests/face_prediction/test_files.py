@@ -129,7 +129,7 @@ def test_a_damaged_track_is_refused_by_name(track_file: Path, change, message: s
         (with_value("orientation", np.full((120, 4), 0.6)), "not of unit length"),
         (with_value("run_start", np.array([0, 40])), "do not divide the frames"),
         (with_value("run_length", np.array([50, 71])), "do not divide the frames"),
-        (with_value("metadata", "{"), "'metadata' is not JSON"),
+        (with_value("metadata", "{"), "'metadata' is not a JSON object"),
     ],
 )
 def test_a_damaged_library_is_refused_by_name(library_file: Path, change, message: str) -> None:
@@ -186,7 +186,7 @@ def test_writing_is_whole_or_not_at_all(tmp_path: Path, monkeypatch) -> None:
 
 def test_an_unwritable_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(RequestError, match="cannot be written"):
+    with pytest.raises(RequestError, match="cannot write to"):
         write_npz(tmp_path / "file" / "out.npz", {"a": np.zeros(3)})
 
 

@@ -11,13 +11,13 @@ import pytest
 
 from face_prediction.commands.train import TrainOptions, run_train
 from face_prediction.dataset.clip_file import EncodedImages, encode_image, write_clip
-from face_prediction.dataset.manifest import (
-    ClipEntry,
-    Manifest,
+from face_prediction.dataset.manifest import ClipEntry, Manifest, write_manifest
+from face_prediction.dataset.sequences import (
+    SequenceSettings,
+    clip_frames,
+    find_sequences,
     sequence_statistics,
-    write_manifest,
 )
-from face_prediction.dataset.sequences import SequenceSettings, clip_frames, find_sequences
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.training import setup as job
 
