@@ -188,7 +188,7 @@ class ZoomingDetector:
         """The followed ``face``, seen through a window if it is small and has left its old one."""
         size = (image.shape[1], image.shape[0])
         centre, width = face.box(size)
-        if self._window is not None and _is_well_inside(self._window, centre, width):
+        if self._window is not None and is_well_inside(self._window, centre, width):
             return face
         window = window_around(centre, width, size)
         if window is None or window == self._window:
@@ -213,7 +213,7 @@ class ZoomingDetector:
         ]
 
 
-def _is_well_inside(window: Crop, centre: np.ndarray, width: float) -> bool:
+def is_well_inside(window: Crop, centre: np.ndarray, width: float) -> bool:
     """Return whether a face of this middle (2,) and width, in pixels, suits the window still."""
     middle = np.array([window.left, window.top]) + window.side / 2
     wanted = window.side / WINDOW_FACES

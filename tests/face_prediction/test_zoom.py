@@ -12,6 +12,7 @@ from face_prediction.tracking.detector import FaceDetection
 from face_prediction.tracking.extract import (
     FaceFollower,
     ZoomingDetector,
+    is_well_inside,
     search_windows,
     whole_image_detection,
     window_around,
@@ -119,8 +120,8 @@ def test_window_around(centre, width, expected) -> None:
 )
 def test_a_window_stands_still_until_the_face_has_left_its_middle(offset, width, fits) -> None:
     window = Crop(490, 210, 300)
-    assert window.fits(np.array([640 + offset, 360]), width) == fits
-    assert window.fits(np.array([640, 360 - offset]), width) == fits
+    assert is_well_inside(window, np.array([640 + offset, 360]), width) == fits
+    assert is_well_inside(window, np.array([640, 360 - offset]), width) == fits
 
 
 @pytest.mark.parametrize("image_size", [(1280, 720), (720, 1280), (90, 90), (3, 2)])
@@ -129,7 +130,7 @@ def test_search_windows_cover_the_image(image_size) -> None:
     for window in search_windows(image_size):
         assert window.left >= 0
         assert window.top >= 0
-        part = window.cut(np.ones((*image_size[::-1], 3), dtype=np.uint8))
+        part = window.region(np.ones((*image_size[::-1], 3), dtype=np.uint8))
         assert part.shape == (window.side, window.side, 3)
         covered[window.top : window.top + window.side, window.left : window.left + window.side] = (
             True
