@@ -1,7 +1,8 @@
 """The command line: ``face-prediction extract | export-motion | …``.
 
-The command ``x-y`` is the module ``x_y`` of this package, with its options ``XYOptions`` and its
-function ``run_x_y``. Only the module of the command that is asked for is imported.
+The command ``x-y`` is the function ``run_x_y`` of the module ``x_y`` of this package; the type of
+its parameter ``options`` gives the options of the command. Only the module of the command that is
+asked for is imported.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import get_type_hints
 
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -60,8 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not given:
         raise RequestError(f"no command given; valid: {', '.join(COMMANDS)}")
     name = require_choice("command", given[0], COMMANDS)
-    module = import_module(f"face_prediction.commands.{name.replace('-', '_')}")
-    options_type = getattr(module, f"{name.title().replace('-', '')}Options")
-    prog = f"face-prediction {name}"
-    options = parse(options_type, None, args=given[1:], prog=prog)
-    return getattr(module, f"run_{name.replace('-', '_')}")(options) or 0
+    stem = name.replace("-", "_")
+    run = getattr(import_module(f"face_prediction.commands.{stem}"), f"run_{stem}")
+    options_type = get_type_hints(run)["options"]
+    return run(parse(options_type, None, args=given[1:], prog=f"face-prediction {name}")) or 0
