@@ -43,7 +43,7 @@ _PLAINER = (
         r"Missing value for argument '?\(?'([^\s',]+)',?\)?'?\. Expected \d+ values?",
         r"\1 needs a value",
     ),
-    (r"Missing from \S+?: ", "missing: "),
+    (r"Missing from [^:]+: ", "missing: "),
     (r" \(required\)", ""),
     (
         r"invalid choice '(.*)' for argument '(.*)'. Expected one of \((.*)\)",
