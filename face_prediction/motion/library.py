@@ -416,10 +416,12 @@ def join_runs(
 def save_motion(path: Path, motion: RecordedMotion) -> None:
     """Write ``motion`` to ``path``, whole or not at all."""
     arrays = {"schema": np.array(SCHEMA), "version": np.array(VERSION)}
-    for name in _ARRAYS:
-        if (value := getattr(motion, name)) is not None:
+    for name in (*list(_ARRAYS)[:-1], "metadata", "predicted_mouth"):
+        value = getattr(motion, name)
+        if name == "metadata":
+            value = json.dumps(value, sort_keys=True)
+        if value is not None:
             arrays[name] = np.asarray(value)
-    arrays["metadata"] = np.array(json.dumps(motion.metadata, sort_keys=True))
     write_npz(path, arrays)
 
 

@@ -22,9 +22,8 @@ NUM_LANDMARKS = 468
 """MediaPipe's face mesh; the ten iris points that the detector adds are not kept."""
 
 _ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
-    "valid": ("bool", ("T",)),
-    "source_valid": ("bool", ("S",)),
     "landmarks": ("float32", ("T", NUM_LANDMARKS, 3)),
+    "valid": ("bool", ("T",)),
     "interpolated": ("bool", ("T",)),
     "timestamps": ("float64", ("T",)),
     "head_pose": ("float64", ("T", 4, 4)),
@@ -32,8 +31,9 @@ _ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "image_size": ("int64", (2,)),
     "fps": ("float64", ()),
     "source_timestamps": ("float64", ("S",)),
+    "source_valid": ("bool", ("S",)),
 }
-"""Type and shape of every array of the file."""
+"""Type and shape of every array, in the order of the file."""
 
 
 class NoFaceError(RequestError):
