@@ -89,7 +89,7 @@ class PredictOptions:
     progress: bool = True
 
 
-def run_predict(options: PredictOptions) -> None:
+def run_predict(options: PredictOptions) -> int:
     """Forecast every frame of every run, and write the library.
 
     Raises:
@@ -149,6 +149,7 @@ def run_predict(options: PredictOptions) -> None:
     save_motion(options.out, library)
     logger.info("%s: %s, forecast by %s", options.out, library.summary(), fits.name)
     print(error_table(errors, fits.name))  # noqa: T201
+    return 0
 
 
 def require_same_motion(
