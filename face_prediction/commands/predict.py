@@ -109,14 +109,14 @@ def run_predict(options: PredictOptions) -> int:
         motion_settings,
         None if given is None else set(given.run_clip.tolist()),
     )
+    clips = [clip for clip in lifted if clip.motion.runs]
+    folds = {clip.row.clip: fold_of(clip, manifest) for clip in clips}
+    predictors = [fits.of(folds[clip.row.clip], clip.row.subject) for clip in clips]
     if given is None:
         library = record_motion(lifted, motion_settings, withheld)
     else:
         require_same_motion(given, lifted, motion_settings)
         library = given
-    clips = [clip for clip in lifted if clip.motion.runs]
-    folds = {clip.row.clip: fold_of(clip, manifest) for clip in clips}
-    predictors = [fits.of(folds[clip.row.clip], clip.row.subject) for clip in clips]
     forecasts: list[NDArray[np.float64]] = []
     short: dict[str, int] = {}
     # the videos are checked before the first is forecast, which may take an hour
