@@ -27,9 +27,8 @@ import numpy as np
 
 from face_prediction.dataset.manifest import CLIP_FOLDER
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.settings import CropFrom
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.dataset.sequences import CropFrom, clip_frames, find_sequences
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import load_track
 
 

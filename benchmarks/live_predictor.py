@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from face_prediction.dataset.history_images import dataset_picture
-from face_prediction.dataset.settings import SequenceSettings
+from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.evaluation.predictors import BaselinePredictor
-from face_prediction.forecast.simple import Persistence
+from face_prediction.forecast.extrapolation import Persistence
 from face_prediction.live.streaming import (
     LandmarkForecaster,
     NetworkForecaster,

@@ -13,7 +13,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.settings import KINDS
+from face_prediction.dataset.sequences import KINDS
 from face_prediction.evaluation.figures import write_figures
 from face_prediction.evaluation.predictors import fit_baselines, group_networks, load_network
 from face_prediction.evaluation.scoring import score_forecasts, score_shuffled_images

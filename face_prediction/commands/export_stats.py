@@ -32,9 +32,9 @@ from face_prediction.evaluation.error_stats import (
 )
 from face_prediction.evaluation.predictors import EvaluatedPredictor, batch_size, cross_fit
 from face_prediction.evaluation.setup import select_sequences
-from face_prediction.motion.library import load_library
+from face_prediction.motion.library import load_motion
 from face_prediction.prediction.errors import mouth_residuals
-from face_prediction.tracking.lifting import VERTICAL_FOV_DEGREES
+from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES
 from robo_manip_baselines.runs.errors import RequestError
 
 logger = logging.getLogger(__name__)
@@ -165,7 +165,7 @@ def library_residuals(dataset: FaceDataset, path: Path, kind: str) -> tuple[Mout
     Raises:
         RequestError: the library holds no forecasts, or none of this kind, or an unknown clip.
     """
-    library = load_library(path)
+    library = load_motion(path)
     if library.predicted_mouth is None:
         raise RequestError("--library: holds no forecasts; make it with face-prediction predict")
     kinds = {clip.clip: clip.kind for clip in dataset.manifest.clips if clip.sequences}

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from face_prediction.tracking.detector import (
-    DetectorSettings,
-    FaceDetector,
-    RunningMode,
-    find_model,
-)
-from face_prediction.tracking.extract import ExtractSettings, extract_track, is_up_to_date
+from face_prediction.tracking.detector import FaceDetector, find_model
+from face_prediction.tracking.extract import ExtractSettings, extract_track, is_track_up_to_date
 from face_prediction.tracking.tracks import save_track
-from face_prediction.tracking.video import FrameBar, require_video, sha256_of
+from face_prediction.tracking.video import require_video
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
 logger = logging.getLogger(__name__)
 
@@ -32,30 +28,20 @@ class ExtractOptions:
     was killed carries on when started again.
 
     Example: face-prediction extract clips/*.mp4 --model face_landmarker.task --out face_tracks
+
+    Attributes:
+        videos: Video files, of any kind that PyAV (FFmpeg) opens.
+        out: Folder for the tracks.
+        model: MediaPipe's face_landmarker.task. By default the one in ~/.cache/face_prediction (or
+            $XDG_CACHE_HOME/face_prediction), downloaded once if there is a network.
+        settings: Settings of the tracks.
+        progress: Show a progress bar for every video.
     """
 
-    #: Video files, of any kind that PyAV (FFmpeg) opens.
     videos: tyro.conf.Positional[tuple[Path, ...]]
-    #: Folder for the tracks.
     out: Path = Path("face_tracks")
-    #: MediaPipe's face_landmarker.task. By default the one in ~/.cache/face_prediction (or
-    #: $XDG_CACHE_HOME/face_prediction), downloaded once if there is a network.
     model: Path | None = None
-    #: Frames per second of the tracks; None keeps the decoded frames as they are.
-    fps: float | None = 30.0
-    #: Longest time in seconds between two decoded frames that is interpolated across.
-    max_gap: float = 0.1
-    #: image: every frame on its own, unsmoothed. video: MediaPipe's own smoothing.
-    running_mode: RunningMode = "image"
-    #: Faces looked for in a frame, so that the tracked one is among them.
-    num_faces: int = 4
-    #: Least score of the face detector.
-    min_detection_confidence: float = 0.5
-    #: Least score of the landmark network's "a face is present".
-    min_presence_confidence: float = 0.5
-    #: Look at small faces through a still window three faces wide (with image only).
-    zoom: bool = True
-    #: Show a progress bar for every video.
+    settings: tyro.conf.OmitArgPrefixes[ExtractSettings] = field(default_factory=ExtractSettings)
     progress: bool = True
 
 
@@ -68,17 +54,7 @@ def run_extract(options: ExtractOptions) -> int:
     Raises:
         RequestError: nothing could be started.
     """
-    settings = ExtractSettings(
-        detector=DetectorSettings(
-            running_mode=options.running_mode,
-            num_faces=options.num_faces,
-            min_detection_confidence=options.min_detection_confidence,
-            min_presence_confidence=options.min_presence_confidence,
-        ),
-        fps=options.fps,
-        max_gap=options.max_gap,
-        zoom=options.zoom,
-    )
+    settings = options.settings
     outputs = output_paths(options.videos, options.out)
     model = find_model(options.model)
     made = kept = refused = 0
@@ -88,12 +64,12 @@ def run_extract(options: ExtractOptions) -> int:
             require_video(video)
             # a detector for each video: in video mode its clock may not run backwards
             with FaceDetector(model, settings.detector) as detector, logging_redirect_tqdm():
-                if is_up_to_date(out, sha256_of(video), settings, detector.description()):
+                if is_track_up_to_date(out, file_digest(video), settings, detector.description()):
                     kept += 1
                     logger.info("%s%s: up to date", prefix, out)
                     continue
-                bar = FrameBar(prefix, options.progress)
-                track = extract_track(video, detector, settings, bar)
+                label = prefix + video.name if options.progress else None
+                track = extract_track(video, detector, settings, label)
             save_track(out, track)
         except RequestError as error:
             if len(outputs) == 1:
@@ -102,13 +78,8 @@ def run_extract(options: ExtractOptions) -> int:
             logger.error("%s%s", prefix, error)
             continue
         made += 1
-        logger.info(
-            "%s%s: %d frames, face in %.1f %%",
-            prefix,
-            out,
-            len(track),
-            100 * float(track.valid.mean()),
-        )
+        share = 100 * float(track.valid.mean())
+        logger.info("%s%s: %d frames, face in %.1f %%", prefix, out, len(track), share)
     if len(outputs) > 1:
         logger.info("%d made, %d already up to date, %d refused", made, kept, refused)
     return 2 if refused else 0

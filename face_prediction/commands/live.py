@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.settings import SequenceSettings
+from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.evaluation.predictors import BaselinePredictor
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
 from face_prediction.live.display import video_sink, window_sink

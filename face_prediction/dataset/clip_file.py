@@ -1,10 +1,14 @@
-"""Pictures to JPEG bytes and back. RGB, (H, W, 3) uint8."""
+"""The file of one clip of a dataset: frames, sequences and their images as JPEG.
+
+Legend: T frames, N sequences, F frames of one, P images.
+"""
 
 from __future__ import annotations
 
 import json
 import zlib
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,18 +16,40 @@ from typing import Any
 import h5py
 import numpy as np
 
-from face_prediction.dataset.manifest import FACTS
-from face_prediction.dataset.sequences import ClipFrames, Sequences
+from face_prediction.dataset.sequences import STATISTICS, ClipFrames, Sequences
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 
-#: Sizes that JPEG can be decoded at without first decoding the whole picture: 1 / these.
+SCHEMA = "face_dataset_clip"
+VERSION = 1
+
 REDUCTIONS = (1, 2, 4, 8)
+"""JPEG images can be decoded at 1 / these of their size without decoding the whole first."""
+
+READ_ERRORS = (KeyError, ValueError, OSError, RuntimeError, TypeError, OverflowError, MemoryError)
+"""Errors that h5py and HDF5 raise on damaged bytes."""
+
+_HDF5_FORMAT = ("v110", "v110")  # from this release on, HDF5 keeps checksums of its own structure
+_CHUNK_BYTES = 65536  # of the images; a sequence of 256 x 256 images is some ten of these
+_CHUNK_FRAMES = 25  # of landmarks; a sequence reads three or four of these
+
+FRAME_ARRAYS: tuple[tuple[str, tuple[int, ...], str, str, str], ...] = (
+    ("landmarks", (468, 3), "float32", "image", "Normalised image coordinates, as in a FaceTrack"),
+    ("valid", (), "bool", "", "The face was found"),
+    ("interpolated", (), "bool", "", "Made from two decoded frames"),
+    ("timestamps", (), "float64", "s", "On the video's clock"),
+    ("mouth", (3,), "float64", "m", "Mouth centre, camera frame"),
+    ("orientation", (4,), "float64", "1", "Quaternion w, x, y, z: camera from head"),
+    ("jaw", (), "float64", "m", "Between the inner lips"),
+    ("source_frame", (), "int64", "", "The decoded frame nearest in time"),
+    ("image_lag", (), "float64", "s", "That frame's time less this one's"),
+)
+"""Arrays of a clip, a row for each frame: name, shape after T, type, unit, description."""
 
 
-def encode_picture(image: np.ndarray, quality: int) -> np.ndarray:
+def encode_image(image: np.ndarray, quality: int) -> np.ndarray:
     """JPEG bytes (N,) uint8 (4:2:0) of ``image`` (H, W, 3)."""
-    import cv2  # not at the top: the command line starts without OpenCV
+    import cv2  # only images need it
 
     options = [
         cv2.IMWRITE_JPEG_QUALITY,
@@ -37,11 +63,11 @@ def encode_picture(image: np.ndarray, quality: int) -> np.ndarray:
     return np.asarray(data, dtype=np.uint8).reshape(-1)
 
 
-def decode_picture(data: np.ndarray, reduce: int = 1) -> np.ndarray:
+def decode_image(data: np.ndarray, reduce: int = 1) -> np.ndarray:
     """(H / reduce, W / reduce, 3) uint8 of JPEG bytes (N,) uint8.
 
     Raises:
-        ValueError: the bytes are no picture, or ``reduce`` is none of `REDUCTIONS`.
+        ValueError: the bytes are no image, or ``reduce`` is none of `REDUCTIONS`.
     """
     import cv2
 
@@ -56,49 +82,38 @@ def decode_picture(data: np.ndarray, reduce: int = 1) -> np.ndarray:
     try:
         image = cv2.imdecode(data, flags[reduce]) if data.size else None
     except cv2.error as error:
-        raise ValueError(f"no picture: {str(error).strip()}") from error
+        raise ValueError(f"no image: {str(error).strip()}") from error
     if image is None:
-        raise ValueError("no picture")
+        raise ValueError("no image")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), dtype=np.uint8)
 
 
-def checksum(data: np.ndarray) -> int:
-    """CRC-32 of encoded bytes."""
-    return zlib.crc32(np.ascontiguousarray(data).data)
+def reduction(crop_size: int, size: int) -> int:
+    """The reduction of images of side ``crop_size`` to side ``size``, one of `REDUCTIONS`.
 
-
-SCHEMA = "face_dataset_clip"
-VERSION = 1
-#: From this release of the file format on, HDF5 keeps checksums of its own structure.
-_HDF5_FORMAT = ("v110", "v110")
-#: Of the pictures' bytes; a sequence of 256 x 256 pictures is some ten of these.
-_CHUNK_BYTES = 65536
-#: Frames of landmarks in one piece: a sequence reads three or four.
-_CHUNK_FRAMES = 25
-#: What h5py and HDF5 raise on damaged bytes.
-READ_ERRORS = (KeyError, ValueError, OSError, RuntimeError, TypeError, OverflowError, MemoryError)
-
-#: Arrays of a clip, a row for each frame: name, shape after T, type, unit, what it is.
-FRAME_ARRAYS: tuple[tuple[str, tuple[int, ...], str, str, str], ...] = (
-    ("landmarks", (468, 3), "float32", "image", "Normalised image coordinates, as in a FaceTrack"),
-    ("valid", (), "bool", "", "The face was found"),
-    ("interpolated", (), "bool", "", "Made from two decoded frames"),
-    ("timestamps", (), "float64", "s", "On the video's clock"),
-    ("mouth", (3,), "float64", "m", "Mouth centre, camera frame"),
-    ("orientation", (4,), "float64", "1", "Quaternion w, x, y, z: camera from head"),
-    ("jaw", (), "float64", "m", "Between the inner lips"),
-    ("source_frame", (), "int64", "", "The decoded frame nearest in time"),
-    ("image_lag", (), "float64", "s", "That frame's time less this one's"),
-)
+    Raises:
+        RequestError: there is none.
+    """
+    for reduce in REDUCTIONS:
+        if size * reduce == crop_size:
+            return reduce
+    sizes = ", ".join(str(crop_size // reduce) for reduce in REDUCTIONS)
+    raise RequestError(
+        f"images of {size} pixels: this dataset can give {sizes}; "
+        "use one with images of the size that the network was trained with"
+    )
 
 
 @dataclass(frozen=True)
-class EncodedPictures:
-    """Pictures of the sequences of a clip, each once, in the order of the sequences."""
+class EncodedImages:
+    """Images of the sequences of a clip, each once, in the order of the sequences.
 
-    #: P arrays of JPEG bytes
+    Attributes:
+        encoded: P arrays of JPEG bytes.
+        index: (N, F) int: the image of each frame.
+    """
+
     encoded: Sequence[np.ndarray]
-    #: (N, F) int: which of them stands for each frame
     index: np.ndarray
 
 
@@ -106,8 +121,8 @@ def write_clip(
     path: Path,
     frames: ClipFrames,
     sequences: Sequences,
-    pictures: EncodedPictures,
-    facts: Mapping[str, np.ndarray],
+    images: EncodedImages,
+    statistics: Mapping[str, np.ndarray],
     record: Mapping[str, Any],
 ) -> None:
     """Write the file of one clip, whole or not at all. The same content gives the same bytes.
@@ -116,11 +131,10 @@ def write_clip(
         path: the file; replaced if it is there.
         frames: of the whole clip.
         sequences: starts, crops and counts.
-        pictures: of the sequences.
-        facts: the columns of `FACTS`, each (N,).
-        record: JSON that says what the file was made from and how; see `build.clip_record`.
+        images: of the sequences.
+        statistics: the columns of `STATISTICS`, each (N,).
+        record: sources and settings of the file; see `build.clip_record`.
     """
-    sizes = [len(data) for data in pictures.encoded]
     with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
         file.attrs["schema"] = SCHEMA
         file.attrs["version"] = VERSION
@@ -141,14 +155,14 @@ def write_clip(
         _write(file, "sequences/start", sequences.start.astype(np.int64))
         corners = [(crop.left, crop.top, crop.side) for crop in sequences.crops]
         _write(file, "sequences/crop", np.array(corners, dtype=np.int64).reshape(-1, 3))
-        for fact in FACTS:
-            item = _write(file, f"sequences/{fact.name}", facts[fact.name].astype(np.float64))
-            item.attrs["unit"], item.attrs["description"] = fact.unit, fact.description
-        _write(file, "pictures/index", pictures.index.astype(np.int64))
-        _write(file, "pictures/offset", np.cumsum([0, *sizes], dtype=np.int64))
-        sums = [checksum(data) for data in pictures.encoded]
+        for name, (unit, description) in STATISTICS.items():
+            item = _write(file, f"sequences/{name}", statistics[name].astype(np.float64))
+            item.attrs["unit"], item.attrs["description"] = unit, description
+        _write(file, "pictures/index", images.index.astype(np.int64))
+        _write(file, "pictures/offset", np.cumsum([0, *map(len, images.encoded)], dtype=np.int64))
+        sums = [zlib.crc32(data.tobytes()) for data in images.encoded]
         _write(file, "pictures/checksum", np.array(sums, dtype=np.uint32))
-        whole = np.concatenate([*pictures.encoded, np.zeros(0, dtype=np.uint8)])
+        whole = np.concatenate([*images.encoded, np.zeros(0, dtype=np.uint8)])
         _write(file, "pictures/data", whole, _CHUNK_BYTES)
 
 
@@ -169,22 +183,19 @@ def open_clip(path: Path) -> h5py.File:
     """
     if not path.is_file():
         raise RequestError(f"{path}: no such file; expected a '{SCHEMA}' .h5")
-    try:
-        file = h5py.File(path, "r")
-    except READ_ERRORS as error:
-        raise RequestError(f"{path}: {damage(error)}") from None
-    try:
-        schema, version = file.attrs.get("schema"), file.attrs.get("version")
-    except READ_ERRORS as error:
-        file.close()
-        raise RequestError(f"{path}: {damage(error)}") from None
-    if schema != SCHEMA or version != VERSION:
-        file.close()
-        raise RequestError(
-            f"{path}: schema '{schema}' version {version}, expected '{SCHEMA}' {VERSION}; "
-            "make the dataset again"
-        )
-    return file
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(h5py.File(path, "r"))
+            schema, version = file.attrs.get("schema"), file.attrs.get("version")
+        except READ_ERRORS as error:
+            raise RequestError(f"{path}: {damage(error)}") from None
+        if schema != SCHEMA or version != VERSION:
+            raise RequestError(
+                f"{path}: schema '{schema}' version {version}, expected '{SCHEMA}' {VERSION}; "
+                "make the dataset again"
+            )
+        stack.pop_all()
+        return file
 
 
 def read_array(path: Path, file: h5py.File, name: str, rows: Any = ()) -> np.ndarray:
@@ -203,7 +214,7 @@ def read_array(path: Path, file: h5py.File, name: str, rows: Any = ()) -> np.nda
 
 
 def read_record(path: Path, file: h5py.File) -> dict[str, Any]:
-    """What the file was made from and how, with ``image_size`` and the counts.
+    """Sources and settings of the file, with ``image_size`` and the counts.
 
     Raises:
         RequestError: it is damaged.

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.clip_file import REDUCTIONS
+from face_prediction.dataset.clip_file import reduction
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.prediction.interface import PictureNeeds
-from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)
@@ -86,18 +85,3 @@ class SequenceBatch:
         """Images (B, H, S, S, 3) of the frames to be forecast."""
         return self._future[size]
 
-
-def reduction(crop_size: int, size: int) -> int:
-    """The factor that reduces images of side ``crop_size`` to side ``size``.
-
-    Raises:
-        RequestError: there is none.
-    """
-    for reduce in REDUCTIONS:
-        if size * reduce == crop_size:
-            return reduce
-    sizes = ", ".join(str(crop_size // reduce) for reduce in REDUCTIONS)
-    raise RequestError(
-        f"images of {size} pixels: this dataset can give {sizes}; "
-        "use one with images of the size that the network was trained with"
-    )

@@ -1,62 +1,63 @@
 """Reading a dataset back, one sequence at a time.
 
-Legend: F frames of a sequence, H history, L = 468 landmarks, S side of the pictures.
+Legend: F frames of a sequence, H history, L = 468 landmarks, S side of the images.
 """
 
 from __future__ import annotations
 
 import os
+import zlib
 from collections import OrderedDict
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
-import h5py
 import numpy as np
 
 from face_prediction.dataset.clip_file import (
     REDUCTIONS,
-    checksum,
     damage,
-    decode_picture,
+    decode_image,
     open_clip,
     read_array,
     read_record,
 )
 from face_prediction.dataset.manifest import (
     CLIP_FOLDER,
-    FACTS,
     ClipEntry,
     FoldSplit,
     SequenceRow,
     fold_split,
     read_manifest,
 )
-from face_prediction.tracking.crop import Crop
+from face_prediction.dataset.sequences import STATISTICS, SequenceSettings
+from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.runs.errors import RequestError
 
-#: Clip files kept open at once; a process may open some thousand.
 MAX_OPEN = 64
+"""Clip files kept open at once; a process may open some thousand."""
 
 
 @dataclass(frozen=True)
 class FaceSequence:
-    """One sequence: what a camera with a fixed picture would have seen, and what it shows."""
+    """One sequence, as a camera that stands still around the face records it.
 
-    #: (F, S, S, 3) uint8 RGB
+    Attributes:
+        pictures: (F, S, S, 3) uint8 RGB.
+        landmarks: (F, 468, 3) float32: u right and v down, 0...1 across the image, and MediaPipe's
+            relative depth in the same unit.
+        timestamps: (F,) float64 s on the video's clock.
+        interpolated: (F,) bool: landmarks made from two decoded frames.
+        image_lag: (F,) float64 s: time of the image less that of the frame (images are not mixed).
+        mouth: (F, 3) float64 m, mouth centre in the camera frame.
+    """
+
     pictures: np.ndarray
-    #: (F, 468, 3) float32: u right and v down, 0...1 across the picture, and MediaPipe's relative
-    #: depth in the same unit
     landmarks: np.ndarray
-    #: (F,) float64 s on the video's clock
     timestamps: np.ndarray
-    #: (F,) bool: landmarks made from two decoded frames
     interpolated: np.ndarray
-    #: (F,) float64 s: time of the picture less that of the frame (pictures are never mixed)
     image_lag: np.ndarray
-    #: (F, 3) float64 m, mouth centre in the camera frame
     mouth: np.ndarray
 
 
@@ -89,12 +90,7 @@ class FaceDataset:
     def __enter__(self) -> FaceDataset:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -126,12 +122,12 @@ class FaceDataset:
         return fold_split(self.manifest.folds, test)
 
     def landmarks(self, index: int) -> np.ndarray:
-        """(F, 468, 3) float32 in the picture's coordinates, without reading pictures."""
+        """(F, 468, 3) float32 in the coordinates of the images, without reading these."""
         reader, number = self._reader(index)
         return reader.landmarks(number)
 
     def pictures(self, index: int, frames: slice | None = None, reduce: int = 1) -> np.ndarray:
-        """Pictures (F, S / reduce, S / reduce, 3) uint8 RGB; only those of ``frames`` are decoded.
+        """Images (F, S / reduce, S / reduce, 3) uint8 RGB; only those of ``frames`` are decoded.
 
         Raises:
             RequestError: the bytes are damaged.
@@ -160,22 +156,22 @@ class FaceDataset:
             if not clip.sequences or clip.fold is None:
                 continue
             reader = self._open(place)
-            columns = {fact.name: reader.array(f"sequences/{fact.name}") for fact in FACTS}
+            columns = {name: reader.array(f"sequences/{name}").tolist() for name in STATISTICS}
             for number, start in enumerate(reader.start.tolist()):
-                facts = {name: float(column[number]) for name, column in columns.items()}
-                result.append(
-                    SequenceRow(clip.clip, number, clip.subject, clip.kind, clip.fold, start, facts)
-                )
+                values = {name: column[number] for name, column in columns.items()}
+                place = (clip.clip, number, clip.subject, clip.kind, clip.fold, start)
+                result.append(SequenceRow(*place, values))
         return result
 
     def _place(self, index: int) -> tuple[int, int]:
-        """Which clip sequence ``index`` is from, and its number in it."""
+        """Clip that sequence ``index`` is from, and its number in the clip."""
         if not 0 <= index < len(self):
             raise IndexError(f"sequence {index}: {self.folder} has {len(self)}")
         place = int(np.searchsorted(self._ends, index, side="right"))
         return place, int(index - self._ends[place] + self.manifest.clips[place].sequences)
 
     def _reader(self, index: int) -> tuple[_ClipReader, int]:
+        """The reader of the clip that sequence ``index`` is from, and its number in the clip."""
         place, number = self._place(index)
         return self._open(place), number
 
@@ -188,13 +184,7 @@ class FaceDataset:
             return self._files[place]
         clip = self.manifest.clips[place]
         path = self.folder / CLIP_FOLDER / f"{clip.clip}.h5"
-        reader = _ClipReader(path, open_clip(path), self.manifest.settings.length)
-        try:
-            reader.require(clip, self.manifest.settings.to_json())
-        except RequestError:
-            reader.file.close()
-            raise
-        self._files[place] = reader
+        reader = self._files[place] = _ClipReader(path, clip, self.manifest.settings)
         if len(self._files) > MAX_OPEN:
             _, oldest = self._files.popitem(last=False)
             oldest.file.close()
@@ -202,19 +192,42 @@ class FaceDataset:
 
 
 class _ClipReader:
-    """The open file of one clip."""
+    """The open file of one clip.
 
-    def __init__(self, path: Path, file: h5py.File, length: int) -> None:
+    Raises:
+        RequestError: it was made from something else, or with other settings.
+    """
+
+    def __init__(self, path: Path, clip: ClipEntry, settings: SequenceSettings) -> None:
         self.path = path
-        self.file = file
-        self._length = length
-        self._record = read_record(path, file)
-        self.start = self.array("sequences/start")
-        self._crops = self.array("sequences/crop")
-        self._index = self.array("pictures/index")
-        self._offset = self.array("pictures/offset")
-        self._checksum = self.array("pictures/checksum")
-        width, height = self._record["image_size"]
+        self.file = open_clip(path)
+        try:
+            record = read_record(path, self.file)
+            self.start = self.array("sequences/start")
+            self._crops = self.array("sequences/crop")
+            self._index = self.array("pictures/index")
+            self._offset = self.array("pictures/offset")
+            self._checksum = self.array("pictures/checksum")
+            wanted = {
+                "clip": clip.clip,
+                "track_sha256": clip.track_sha256,
+                "video_sha256": clip.video_sha256,
+                "settings": settings.to_json(),
+            }
+            wrong = [key for key, value in wanted.items() if record.get(key) != value]
+            shape = (clip.sequences, settings.length)
+            if len(self.start) != clip.sequences or self._index.shape != shape:
+                wrong.append("sequences")
+            if wrong:
+                raise RequestError(
+                    f"{path}: its {', '.join(wrong)} are not those of the dataset; "
+                    "make the dataset again"
+                )
+        except RequestError:
+            self.file.close()
+            raise
+        self._length = settings.length
+        width, height = record["image_size"]
         self._image_size = (int(width), int(height))
 
     def array(self, name: str, rows: Any = ()) -> np.ndarray:
@@ -223,30 +236,6 @@ class _ClipReader:
     def rows(self, number: int) -> slice:
         start = int(self.start[number])
         return slice(start, start + self._length)
-
-    def require(self, clip: ClipEntry, settings: dict[str, Any]) -> None:
-        """Check that the file is the one that the list of clips means.
-
-        Raises:
-            RequestError: it was made from something else, or with other settings.
-        """
-        wanted = {
-            "clip": clip.clip,
-            "track_sha256": clip.track_sha256,
-            "video_sha256": clip.video_sha256,
-            "settings": settings,
-        }
-        wrong = [key for key, value in wanted.items() if self._record.get(key) != value]
-        if len(self.start) != clip.sequences or self._index.shape != (
-            clip.sequences,
-            self._length,
-        ):
-            wrong.append("sequences")
-        if wrong:
-            raise RequestError(
-                f"{self.path}: its {', '.join(wrong)} are not those of the dataset; "
-                "make the dataset again"
-            )
 
     def landmarks(self, number: int) -> np.ndarray:
         crop = Crop(*map(int, self._crops[number]))
@@ -263,12 +252,12 @@ class _ClipReader:
         first = int(self._offset[wanted[0]])
         data = self.array("pictures/data", slice(first, int(self._offset[wanted[-1] + 1])))
         images: list[np.ndarray] = []
-        for picture in wanted.tolist():
-            encoded = data[self._offset[picture] - first : self._offset[picture + 1] - first]
+        for image in wanted.tolist():
+            encoded = data[self._offset[image] - first : self._offset[image + 1] - first]
             try:
-                if checksum(encoded) != int(self._checksum[picture]):
+                if zlib.crc32(encoded.tobytes()) != int(self._checksum[image]):
                     raise ValueError("its checksum is wrong")
-                images.append(decode_picture(encoded, reduce))
+                images.append(decode_image(encoded, reduce))
             except ValueError as error:
-                raise RequestError(f"{self.path}: picture {picture}: {damage(error)}") from None
+                raise RequestError(f"{self.path}: image {image}: {damage(error)}") from None
         return np.stack(images)[place]

@@ -1,41 +1,157 @@
-"""A face track to frames at a constant rate, and the sequences that can be cut from them.
+"""Sequences of a clip: settings, frames at a constant rate, cutting, and statistics.
 
-Legend: T frames, S decoded frames, N sequences, L = 468 landmarks.
+Legend: T frames, S decoded frames, N sequences, F frames of one, L = 468 landmarks.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
 
 import numpy as np
+import tyro
 
-from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.motion.motion import Quality, assess, has_constant_rate
-from face_prediction.tracking.crop import Crop, crop_around
+from face_prediction.motion.library import Attribution
+from face_prediction.motion.motion import Quality, QualityLimits, assess
 from face_prediction.tracking.extract import SAME_TIME, Samples, resample
-from face_prediction.tracking.geometry import quaternion_from_matrix, rigid_head_poses
-from face_prediction.tracking.lifting import jaw_openings, mouth_centres
+from face_prediction.tracking.geometry import LIPS, Crop, crop_around, lift_landmarks
 from face_prediction.tracking.tracks import FaceTrack
 from robo_manip_baselines.runs.errors import RequestError
 
-#: Why a sequence is dropped; the first that holds is counted.
+CropFrom = Literal["history", "sequence"]
+
 REASONS: tuple[str, ...] = ("no_face", "jump", "spike")
+"""Reasons for dropping a sequence; the first that holds is counted."""
+
+KINDS = ("natural", "head_motion", "grid")
+"""Kinds of footage. natural: people who talk or look about, mixed. head_motion: clear or deliberate
+motion of the head. grid: the GRID corpus, sentences read with hardly any motion of the head."""
+HEAD_MOTION_WORDS = ("nod", "nodding", "turn", "turning", "tilt", "tilting", "large motion")
+"""Words of a table's column `what` that mean head_motion."""
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """Settings of cutting clips into sequences; recorded with them.
+
+    Attributes:
+        history: Frames that a predictor gets (paper, IV.B).
+        future: Frames that it predicts (paper, IV.B).
+        fps: Frames per second of the sequences (paper, IV.B).
+        stride: Frames between the starts of neighbouring sequences.
+        margin: Room on each side of the face, in lengths of the longer side of the box around it.
+        crop_from: Frames that the crop is laid around. With sequence the face never leaves it, but
+            the place of the crop reveals the future motion (docs/face_dataset.md).
+        crop_size: Side of the images in pixels (paper, IV.A).
+        quality: Quality of the JPEG images, 1 to 100.
+        limits: Limits of human motion; anything beyond is a jump of the detector. No option.
+
+    Raises:
+        RequestError: a value is out of its range; the message names the option.
+    """
+
+    history: int = 70
+    future: int = 5
+    fps: float = 30.0
+    stride: int = 15
+    margin: float = 0.1
+    crop_from: CropFrom = "history"
+    crop_size: int = 256
+    quality: int = 90
+    limits: tyro.conf.Suppress[QualityLimits] = field(default_factory=QualityLimits)
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("history", 1, 10_000),
+            ("future", 1, 10_000),
+            ("stride", 1, 1_000_000),
+            ("crop_size", 16, 4096),
+            ("quality", 1, 100),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise RequestError(f"--{name} {value}: between {low} and {high}")
+        if not 0.0 < self.fps <= 1000.0:
+            raise RequestError(f"--fps {self.fps}: more than 0, up to 1000")
+        if not (math.isfinite(self.margin) and 0.0 <= self.margin <= 2.0):
+            raise RequestError(f"--margin {self.margin}: between 0 and 2")
+        if self.crop_from not in ("history", "sequence"):
+            raise RequestError(f"--crop_from {self.crop_from}: history or sequence")
+
+    @property
+    def length(self) -> int:
+        """Frames of a sequence."""
+        return self.history + self.future
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers and text, what `from_json` takes."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, data: Any) -> SequenceSettings:
+        """Undo `to_json`.
+
+        Raises:
+            RequestError: ``data`` holds other keys or values that are no settings.
+        """
+        wanted = {item.name for item in fields(cls)}
+        if not isinstance(data, Mapping) or set(data) != wanted:
+            raise RequestError(f"settings need the keys {', '.join(sorted(wanted))}")
+        try:
+            return cls(**{**data, "limits": QualityLimits(**data["limits"])})
+        except TypeError as error:
+            raise RequestError(f"settings are not as expected: {error}") from None
+
+
+def kind_of(row: Attribution) -> str:
+    """Kind of a clip by its row in the table of attributions.
+
+    ``kind`` counts as it stands; then a name that begins with ``grid`` is grid; then the words of
+    `HEAD_MOTION_WORDS` in ``what`` decide.
+
+    Raises:
+        RequestError: ``kind`` is none of `KINDS`.
+    """
+    if row.kind:
+        if row.kind not in KINDS:
+            raise RequestError(f"kind '{row.kind}' of clip '{row.clip}'; one of {', '.join(KINDS)}")
+        return row.kind
+    if row.clip.lower().startswith("grid"):
+        return "grid"
+    words = "|".join(HEAD_MOTION_WORDS)
+    return "head_motion" if re.search(rf"\b({words})\b", row.what.lower()) else "natural"
 
 
 @dataclass(frozen=True)
 class ClipFrames:
-    """One clip at the rate of its sequences; NaN where there is no face."""
+    """One clip at the rate of its sequences; NaN where there is no face.
 
-    landmarks: np.ndarray  # (T, 468, 3) float32 normalised image coordinates
-    valid: np.ndarray  # (T,) bool
-    interpolated: np.ndarray  # (T,) bool
-    timestamps: np.ndarray  # (T,) s on the video's clock
-    mouth: np.ndarray  # (T, 3) m, camera frame
-    orientation: np.ndarray  # (T, 4) wxyz, camera from head
-    jaw: np.ndarray  # (T,) m between the inner lips
-    source_frame: np.ndarray  # (T,) int: the decoded frame nearest in time
-    image_lag: np.ndarray  # (T,) s: that frame's time less this one's
+    Attributes:
+        landmarks: (T, 468, 3) float32 normalised image coordinates.
+        valid: (T,) bool.
+        interpolated: (T,) bool.
+        timestamps: (T,) s on the video's clock.
+        mouth: (T, 3) m, camera frame.
+        orientation: (T, 4) wxyz, camera from head.
+        jaw: (T,) m between the inner lips.
+        source_frame: (T,) int: the decoded frame nearest in time; of two as near, the earlier.
+        image_lag: (T,) s: time of that frame less that of this one.
+        image_size: (width, height) in pixels.
+        quality: of frames and steps.
+    """
+
+    landmarks: np.ndarray
+    valid: np.ndarray
+    interpolated: np.ndarray
+    timestamps: np.ndarray
+    mouth: np.ndarray
+    orientation: np.ndarray
+    jaw: np.ndarray
+    source_frame: np.ndarray
+    image_lag: np.ndarray
     image_size: tuple[int, int]
     quality: Quality
 
@@ -45,10 +161,17 @@ class ClipFrames:
 
 @dataclass(frozen=True)
 class Sequences:
-    """Where the sequences of a clip start, their crops, and how many were dropped and why."""
+    """Sequences of a clip.
 
-    start: np.ndarray  # (N,) int
-    crops: tuple[Crop, ...]  # N
+    Attributes:
+        start: (N,) int, first frames.
+        crops: N crops.
+        candidates: starts that were tried.
+        dropped: how many were dropped for each of `REASONS`.
+    """
+
+    start: np.ndarray
+    crops: tuple[Crop, ...]
     candidates: int
     dropped: Mapping[str, int]
 
@@ -57,7 +180,7 @@ class Sequences:
 
 
 def clip_frames(track: FaceTrack, settings: SequenceSettings) -> ClipFrames:
-    """Bring ``track`` to the rate of the sequences, lift it to metres and judge every frame.
+    """Bring ``track`` to the rate of the sequences, lift it to metres and rate every frame.
 
     Raises:
         RequestError: the track shows no face.
@@ -65,42 +188,52 @@ def clip_frames(track: FaceTrack, settings: SequenceSettings) -> ClipFrames:
     if not track.valid.any():
         name = track.source.get("name", "track")
         raise RequestError(f"{name}: its track holds no frame with a face; leave this clip out")
-    samples, interpolated = _at_rate(track, settings.fps)
-    valid = samples.valid
-    landmarks = samples.landmarks.astype(np.float64)
-    pose = rigid_head_poses(landmarks, valid, track.image_size)
-    mouth = mouth_centres(landmarks, pose, track.image_size)
-    jaw = jaw_openings(landmarks, pose, track.image_size)
-    orientation = np.full((len(valid), 4), np.nan)
-    orientation[valid] = quaternion_from_matrix(pose[valid, :3, :3])
-    nearest = _nearest(track.source_timestamps, samples.timestamps)
+    samples = Samples(track.timestamps, track.landmarks, track.head_pose, track.valid)
+    interpolated, fps = track.interpolated, settings.fps
+    if abs(track.fps - fps) >= 1e-6 * fps or not track.has_constant_rate:
+        samples, made = resample(samples, fps)
+        after = np.searchsorted(track.timestamps, samples.timestamps - SAME_TIME)
+        after = np.clip(after, 0, len(track) - 1)
+        before = np.maximum(after - 1, 0)
+        guessed = track.interpolated[after] | (made & track.interpolated[before])
+        interpolated = (made | guessed) & samples.valid
+    mouth, orientation, jaw = lift_landmarks(samples.landmarks, samples.valid, track.image_size)
+    times, wanted = track.source_timestamps, samples.timestamps
+    after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    is_later = wanted - times[before] > times[after] - wanted + SAME_TIME
+    nearest = np.where(is_later, after, before)
     return ClipFrames(
         landmarks=samples.landmarks.astype(np.float32),
-        valid=valid,
+        valid=samples.valid,
         interpolated=interpolated,
-        timestamps=samples.timestamps,
+        timestamps=wanted,
         mouth=mouth,
         orientation=orientation,
         jaw=jaw,
         source_frame=nearest,
-        image_lag=track.source_timestamps[nearest] - samples.timestamps,
+        image_lag=times[nearest] - wanted,
         image_size=track.image_size,
-        quality=assess(mouth, orientation, jaw, settings.fps, settings.limits),
+        quality=assess(mouth, orientation, jaw, fps, settings.limits),
     )
 
 
 def find_sequences(frames: ClipFrames, settings: SequenceSettings) -> Sequences:
-    """Every ``stride`` frames a sequence, unless the face is lost or jumps in it."""
-    length = settings.length
+    """A sequence every ``stride`` frames, unless the face is lost or jumps in it."""
+    length, quality = settings.length, frames.quality
     starts = range(0, len(frames) - length + 1, settings.stride)
     kept: list[int] = []
-    dropped: dict[str, int] = dict.fromkeys(REASONS, 0)
+    dropped = dict.fromkeys(REASONS, 0)
     for start in starts:
-        reason = why_dropped(frames.quality, start, start + length)
-        if reason is None:
-            kept.append(start)
+        stop = start + length
+        if not quality.found[start:stop].all():
+            dropped["no_face"] += 1
+        elif quality.jump[start : stop - 1].any():
+            dropped["jump"] += 1
+        elif quality.spike[start:stop].any():
+            dropped["spike"] += 1
         else:
-            dropped[reason] += 1
+            kept.append(start)
     seen = settings.history if settings.crop_from == "history" else length
     crops = tuple(
         crop_around(frames.landmarks[s : s + seen], frames.image_size, settings.margin)
@@ -109,36 +242,57 @@ def find_sequences(frames: ClipFrames, settings: SequenceSettings) -> Sequences:
     return Sequences(np.array(kept, dtype=np.int64), crops, len(starts), dropped)
 
 
-def why_dropped(quality: Quality, start: int, stop: int) -> str | None:
-    """The first of `REASONS` that holds in frames [start, stop), or None."""
-    if not quality.found[start:stop].all():
-        return "no_face"
-    if quality.jump[start : stop - 1].any():
-        return "jump"
-    # the ends of a sequence are no spikes of its own: a spike needs both neighbours
-    if quality.spike[start:stop].any():
-        return "spike"
-    return None
+STATISTICS: dict[str, tuple[str, str]] = {
+    "start_time": ("s", "Time of the first frame on the video's clock"),
+    "mouth_range_u": ("crop", "Largest less smallest u of the mouth centre"),
+    "mouth_range_v": ("crop", "Largest less smallest v of the mouth centre"),
+    "mouth_range_x": ("m", "The same of its lifted position, x"),
+    "mouth_range_y": ("m", "... y"),
+    "mouth_range_z": ("m", "... z (away from the camera; the least certain)"),
+    "head_rotation_range": ("deg", "Largest angle between the head's orientations in any two"),
+    "mouth_opening_range": ("m", "Largest less smallest distance between the inner lips"),
+    "interpolated_share": ("1", "Share of frames made from two decoded ones"),
+    "image_lag": ("s", "Longest time between a frame and the picture that stands for it"),
+    "crop_side": ("px", "Side of the crop in the video"),
+    "crop_padding": ("1", "Share of the crop outside the video's picture (black)"),
+    "outside_share": ("1", "Share of the frames to predict in which the face leaves the crop"),
+}
+"""Statistics of a sequence: name, unit and description, the columns of the table of sequences."""
 
 
-def _at_rate(track: FaceTrack, fps: float) -> tuple[Samples, np.ndarray]:
-    samples = Samples(track.timestamps, track.landmarks, track.head_pose, track.valid)
-    if abs(track.fps - fps) < 1e-6 * fps and has_constant_rate(track):
-        return samples, track.interpolated
-    resampled, made = resample(samples, fps)
-    after = np.searchsorted(track.timestamps, resampled.timestamps - SAME_TIME)
-    after = np.clip(after, 0, len(track) - 1)
-    before = np.maximum(after - 1, 0)
-    guessed = track.interpolated[after] | (made & track.interpolated[before])
-    return resampled, (made | guessed) & resampled.valid
+def sequence_statistics(
+    frames: ClipFrames, sequences: Sequences, settings: SequenceSettings
+) -> dict[str, np.ndarray]:
+    """The columns of `STATISTICS`, each (N,) float64."""
+    rows: list[dict[str, Any]] = []
+    for start, crop in zip(sequences.start.tolist(), sequences.crops, strict=True):
+        part = slice(start, start + settings.length)
+        points = crop.normalise(frames.landmarks[part], frames.image_size)[..., :2]  # (F, 468, 2)
+        u, v = np.ptp(points[:, list(LIPS)].mean(axis=1), axis=0)
+        x, y, z = np.ptp(frames.mouth[part], axis=0)
+        future = points[settings.history :]
+        outside = np.any((future < 0.0) | (future > 1.0), axis=(1, 2))
+        rows.append(
+            {
+                "start_time": frames.timestamps[start],
+                "mouth_range_u": u,
+                "mouth_range_v": v,
+                "mouth_range_x": x,
+                "mouth_range_y": y,
+                "mouth_range_z": z,
+                "head_rotation_range": largest_angle(frames.orientation[part]),
+                "mouth_opening_range": np.ptp(frames.jaw[part]),
+                "interpolated_share": frames.interpolated[part].mean(),
+                "image_lag": np.abs(frames.image_lag[part]).max(),
+                "crop_side": crop.side,
+                "crop_padding": crop.padding(frames.image_size),
+                "outside_share": outside.mean(),
+            }
+        )
+    return {name: np.array([row[name] for row in rows], dtype=np.float64) for name in STATISTICS}
 
 
-def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Index into increasing ``times`` (S,) of the one nearest to each of ``wanted`` (T,).
-
-    Of two as near, the earlier one.
-    """
-    after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    later = wanted - times[before] > times[after] - wanted + SAME_TIME
-    return np.where(later, after, before)
+def largest_angle(orientation: np.ndarray) -> float:
+    """Largest angle in degrees between any two of the unit quaternions (F, 4)."""
+    cosine = np.abs(orientation @ orientation.T).min()
+    return float(np.degrees(2 * np.arccos(np.clip(cosine, 0.0, 1.0))))

@@ -20,7 +20,7 @@ from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
 from face_prediction.evaluation.statistics import KindSummary, RowSummary
 from face_prediction.prediction.errors import mouth_distances
 from face_prediction.prediction.interface import Forecast
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 

@@ -27,7 +27,7 @@ from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import KindSummary
 from face_prediction.forecast.interface import mouth_centre
 from face_prediction.prediction.errors import mouth_distances
-from face_prediction.tracking.crop import Crop
+from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 

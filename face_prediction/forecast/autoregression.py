@@ -1,14 +1,14 @@
 """Vector autoregression by least squares: fitting, stability, forecasting, choice of order.
 
 x[t] = sum over k = 1..P of x[t - k] @ A[k - 1] + noise, without a constant: x are displacements
-from frame to frame, and a drift learnt from other people is none of this one's.
+from frame to frame, and a drift learnt from other people does not apply to this one.
 
 Legend: N sequences, T frames, P order, D components, H horizon, B batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
@@ -32,54 +32,48 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-#: Share of the regressors' mean square that is added to the diagonal: keeps still faces solvable
-#: and changes coefficients by parts in a million.
 RIDGE = 1e-6
-#: Largest modulus of an eigenvalue; a displacement then halves within 70 frames at the latest.
+"""Share of the regressors' mean square that is added to the diagonal: keeps still faces solvable
+and changes coefficients by parts in a million."""
 MAX_RADIUS = 0.99
-#: Parts that the subjects are dealt into to choose an order
+"""Largest modulus of an eigenvalue; a displacement then halves within 70 frames at the latest."""
+HORIZON = 5
+"""The paper's horizon: frames 71 to 75."""
+MOUTH_ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
+LANDMARK_ORDERS = (1, 2, 3, 4, 6)
+COMPONENTS = (2, 4, 8, 16)
+"""Shapes of displacement kept; a rigid head that moves parallel to the image has two."""
 FOLDS = 5
-#: Frames between the ends of the histories that a choice is judged at, and how many a sequence
-_ORIGIN_STEP = 10
-_ORIGINS = 4
+"""Parts that the subjects are divided into to choose an order."""
+_ORIGIN_STEP = 10  # frames between the ends of the histories that orders are compared at
+_ORIGINS = 4  # such histories in a sequence
+_SHAPE_STRIDE = 5  # frames between those that enter the principal components: neighbours are alike
 
 
-@dataclass(frozen=True)
-class Moments:
-    """Sums over rows of regressors and targets: ``cross`` (P, D, P, D) and ``aim`` (P, D, D)."""
+def moments(series: Floats, order: int) -> Floats:
+    """Moments (P, D, P + 1, D) of ``series`` (N, T, D), summed over frames.
 
-    cross: Floats
-    aim: Floats
-
-    def __sub__(self, other: Moments) -> Moments:
-        return Moments(self.cross - other.cross, self.aim - other.aim)
-
-    def __add__(self, other: Moments) -> Moments:
-        return Moments(self.cross + other.cross, self.aim + other.aim)
-
-
-def moments(series: Floats, order: int) -> Moments:
-    """Moments of ``series`` (N, T, D); lag k stands at index k - 1."""
-    size = series.shape[1]
+    Products of the value k frames ago (k - 1 along the first axis) with the present value (0 along
+    the third axis) and with the values 1...P frames ago.
+    """
+    size, components = series.shape[1:]
     lagged = np.stack(
         [series[:, order - k : size - k] for k in range(1, order + 1)], axis=2
     )  # (N, T - P, P, D)
-    components = series.shape[2]
     rows = lagged.reshape(-1, order * components)
     target = series[:, order:].reshape(-1, components)
-    shape = (order, components)
-    return Moments(
-        (rows.T @ rows).reshape(*shape, *shape), (rows.T @ target).reshape(*shape, components)
-    )
+    shape = (order, components, -1, components)
+    products = [(rows.T @ columns).reshape(shape) for columns in (target, rows)]
+    return np.concatenate(products, axis=2)
 
 
-def solve(sums: Moments, order: int, components: int) -> Floats:
+def solve(sums: Floats, order: int, components: int) -> Floats:
     """Coefficients (P, D, D) of the first ``order`` lags and ``components`` components; stable."""
     size = order * components
-    cross = sums.cross[:order, :components, :order, :components].reshape(size, size)
-    aim = sums.aim[:order, :components, :components].reshape(size, components)
+    used = sums[:order, :components, : order + 1, :components]
+    cross = used[:, :, 1:].reshape(size, size)
     ridge = RIDGE * max(np.trace(cross) / size, np.finfo(float).tiny)
-    solved = np.linalg.solve(cross + ridge * np.eye(size), aim)
+    solved = np.linalg.solve(cross + ridge * np.eye(size), used[:, :, 0].reshape(size, components))
     return stabilised(solved.reshape(order, components, components))
 
 
@@ -104,7 +98,7 @@ def stabilised(coefficients: Floats, limit: float = MAX_RADIUS) -> Floats:
 def forecast(coefficients: Floats, recent: Floats, horizon: int) -> Floats:
     """Expected next values (B, H, D) after ``recent`` (B, any, D), the newest last.
 
-    Before what is given the series is taken to have been 0.
+    Before ``recent`` the series is taken to have been 0.
     """
     order = len(coefficients)
     newest_first = [recent[:, -k] for k in range(1, min(order, recent.shape[1]) + 1)]
@@ -117,25 +111,12 @@ def forecast(coefficients: Floats, recent: Floats, horizon: int) -> Floats:
     return np.stack(result, axis=1)
 
 
-def choose(
-    series: Floats,
-    mouth: Floats,
-    readout: Floats,
-    subjects: tuple[str, ...],
-    candidates: Iterable[tuple[int, int]],
-    horizon: int,
-) -> tuple[int, int]:
-    """The (order, components) with the least of `held_out_errors`; the smaller of equal ones."""
-    errors = held_out_errors(series, mouth, readout, subjects, candidates, horizon)
-    return min(sorted(errors), key=errors.__getitem__)
-
-
 def held_out_errors(
     series: Floats,
     mouth: Floats,
     readout: Floats,
     subjects: tuple[str, ...],
-    candidates: Iterable[tuple[int, int]],
+    candidates: Sequence[tuple[int, int]],
     horizon: int,
 ) -> dict[tuple[int, int], float]:
     """Error of each (order, components) on subjects that were not fitted to.
@@ -151,21 +132,27 @@ def held_out_errors(
     Raises:
         RequestError: all sequences are of one subject, or too short for the candidates.
     """
-    wanted = list(candidates)
-    longest = max(order for order, _ in wanted)
+    longest = max(order for order, _ in candidates)
     if len(set(subjects)) < 2:
         raise RequestError(
             "sequences of 1 subject; an order is chosen on people held out: give 2 or more "
             "subjects, or the order"
         )
-    origins = _origins(series.shape[1], longest, horizon)
+    steps = series.shape[1]
+    if steps - horizon < longest:
+        raise RequestError(
+            f"sequences of {steps + 1} frames; order {longest} and horizon {horizon} need "
+            f"{longest + horizon + 1} or more"
+        )
+    # ends of histories, the last first, each with ``horizon`` steps after it
+    origins = range(steps - horizon, longest - 1, -_ORIGIN_STEP)[:_ORIGINS]
     fold = subject_folds(subjects, FOLDS)
     parts = [moments(series[fold == f], longest) for f in range(fold.max() + 1)]
     whole = sum(parts[1:], parts[0])
-    totals = dict.fromkeys(wanted, 0.0)
+    totals = dict.fromkeys(candidates, 0.0)
     for f, part in enumerate(parts):
         rest = whole - part
-        for order, components in wanted:
+        for order, components in candidates:
             coefficients = solve(rest, order, components)
             for origin in origins:
                 recent = series[fold == f, :origin, :components]
@@ -177,6 +164,11 @@ def held_out_errors(
     return {pair: total / count for pair, total in totals.items()}
 
 
+def least_error(errors: Mapping[tuple[int, int], float]) -> tuple[int, int]:
+    """The (order, components) of the least error; the smaller of equal ones."""
+    return min(sorted(errors), key=errors.__getitem__)
+
+
 def require_order(order: int, steps: int) -> None:
     """Raise RequestError unless ``steps`` displacements a sequence leave rows to fit ``order``."""
     if not 1 <= order < steps:
@@ -185,38 +177,36 @@ def require_order(order: int, steps: int) -> None:
         )
 
 
-def _origins(steps: int, order: int, horizon: int) -> list[int]:
-    """Ends of histories, the last first, each with ``horizon`` steps after it."""
-    last = steps - horizon
-    if last < order:
-        raise RequestError(
-            f"sequences of {steps + 1} frames; order {order} and horizon {horizon} need "
-            f"{order + horizon + 1} or more"
-        )
-    return list(range(last, order - 1, -_ORIGIN_STEP))[:_ORIGINS]
+@dataclass(frozen=True)
+class _Autoregression(Forecaster):
+    coefficients: Floats
 
+    @property
+    def memory(self) -> int:
+        """The last frame and one for every lag."""
+        return len(self.coefficients) + 1
 
-#: The paper's horizon: frames 71 to 75
-HORIZON = 5
-MOUTH_ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
-LANDMARK_ORDERS = (1, 2, 3, 4, 6)
-#: Shapes of displacement kept; a rigid head that moves parallel to the image has two.
-COMPONENTS = (2, 4, 8, 16)
-#: Every so many frames of a sequence one enters the principal components: neighbours are alike.
-_SHAPE_STRIDE = 5
+    def _check_coefficients(self, components: int) -> None:
+        shape = self.coefficients.shape
+        if len(shape) != 3 or shape[0] < 1 or shape[1:] != (components, components):
+            raise RequestError(
+                f"{self.name}: coefficients {shape}; expected (order, {components}, {components})"
+            )
 
 
 @dataclass(frozen=True)
-class MouthAutoregression(Forecaster):
-    """The face moves as a whole by what autoregression on the mouth centre expects."""
+class MouthAutoregression(_Autoregression):
+    """The face moves as a whole by the forecast displacement of the mouth centre.
 
-    #: (P, 2, 2): the displacement k frames ago, as a row (u, v), times ``coefficients[k - 1]``
-    coefficients: NDArray[np.float64]
+    Attributes:
+        coefficients: (P, 2, 2): the displacement k frames ago, as a row (u, v), times
+            ``coefficients[k - 1]``.
+    """
 
     name = "ar_mouth"
 
     def __post_init__(self) -> None:
-        _check_coefficients(self.name, self.coefficients, 2)
+        self._check_coefficients(2)
 
     @classmethod
     def fit(cls, sequences: LandmarkSequences, order: int | None = None) -> Self:
@@ -228,35 +218,33 @@ class MouthAutoregression(Forecaster):
         steps = np.diff(mouth_centre(sequences.landmarks), axis=1)
         if order is None:
             pairs = [(p, 2) for p in _possible(MOUTH_ORDERS, steps.shape[1])]
-            order, _ = choose(steps, steps, np.eye(2), sequences.subjects, pairs, HORIZON)
+            errors = held_out_errors(steps, steps, np.eye(2), sequences.subjects, pairs, HORIZON)
+            order, _ = least_error(errors)
         require_order(order, steps.shape[1])
         return cls(solve(moments(steps, order), order, 2))
 
-    @property
-    def memory(self) -> int:
-        """The last frame and one for every lag."""
-        return len(self.coefficients) + 1
-
-    def _forecast(self, history: Array, horizon: int) -> NDArray[np.float64]:
+    def _forecast(self, history: Array, horizon: int) -> Floats:
         steps = np.diff(mouth_centre(history), axis=1)
         shift = np.cumsum(forecast(self.coefficients, steps, horizon), axis=1)
         return history[:, -1:].astype(np.float64) + shift[:, :, None]
 
 
 @dataclass(frozen=True)
-class LandmarkAutoregression(Forecaster):
-    """Autoregression on the principal components of all landmarks' displacements."""
+class LandmarkAutoregression(_Autoregression):
+    """Autoregression on the principal components of all landmarks' displacements.
 
-    #: (P, D, D)
-    coefficients: NDArray[np.float64]
-    #: (D, 2 L) orthonormal rows: u and v of landmark 0, of landmark 1, ...
-    basis: NDArray[np.float64]
+    Attributes:
+        coefficients: (P, D, D).
+        basis: (D, 2 L) orthonormal rows: u and v of landmark 0, of landmark 1, ...
+    """
+
+    basis: Floats
 
     name = "ar_landmarks"
 
     def __post_init__(self) -> None:
         components = len(self.basis)
-        _check_coefficients(self.name, self.coefficients, components)
+        self._check_coefficients(components)
         if self.basis.shape != (components, 2 * NUM_LANDMARKS):
             raise RequestError(
                 f"{self.name}: basis {self.basis.shape}; expected (any, {2 * NUM_LANDMARKS})"
@@ -279,19 +267,15 @@ class LandmarkAutoregression(Forecaster):
             readout = mouth_centre(basis.reshape(len(basis), NUM_LANDMARKS, 2))
             mouth = np.diff(mouth_centre(sequences.landmarks), axis=1)
             orders = _possible(LANDMARK_ORDERS, steps.shape[1])
-            pairs = product(orders, [d for d in COMPONENTS if d <= len(basis)])
-            order, components = choose(steps, mouth, readout, sequences.subjects, pairs, HORIZON)
+            pairs = list(product(orders, [d for d in COMPONENTS if d <= len(basis)]))
+            errors = held_out_errors(steps, mouth, readout, sequences.subjects, pairs, HORIZON)
+            order, components = least_error(errors)
         require_order(order, steps.shape[1])
         components = min(components, len(basis))
         fitted = solve(moments(steps[..., :components], order), order, components)
         return cls(fitted, basis[:components])
 
-    @property
-    def memory(self) -> int:
-        """The last frame and one for every lag."""
-        return len(self.coefficients) + 1
-
-    def _forecast(self, history: Array, horizon: int) -> NDArray[np.float64]:
+    def _forecast(self, history: Array, horizon: int) -> Floats:
         flat = history.reshape(*history.shape[:2], -1).astype(np.float64)
         steps = np.diff(flat @ self.basis.T, axis=1)
         shift = np.cumsum(forecast(self.coefficients, steps, horizon), axis=1) @ self.basis
@@ -299,11 +283,11 @@ class LandmarkAutoregression(Forecaster):
         return ahead.reshape(len(history), horizon, *history.shape[2:])
 
 
-def principal_shapes(landmarks: Array, components: int) -> NDArray[np.float64]:
-    """Orthonormal rows (D, 2 L): how landmarks (N, T, L, 2) leave their sequence's mean.
+def principal_shapes(landmarks: Array, components: int) -> Floats:
+    """Principal components of landmarks (N, T, L, 2) about their sequence's mean: rows (D, 2 L).
 
-    The D <= ``components`` directions of most variance, most first; each has its largest entry
-    positive, so that the same data give the same signs.
+    Orthonormal, the D <= ``components`` directions of most variance, most first; the largest entry
+    of each is positive, so that the same data give the same signs.
     """
     some = landmarks[:, ::_SHAPE_STRIDE]
     apart = some - some.mean(axis=1, keepdims=True, dtype=np.float64)
@@ -317,11 +301,3 @@ def principal_shapes(landmarks: Array, components: int) -> NDArray[np.float64]:
 def _possible(orders: tuple[int, ...], steps: int) -> list[int]:
     """The orders that ``steps`` displacements a sequence allow; the smallest at least."""
     return [p for p in orders if p + HORIZON <= steps] or [min(orders)]
-
-
-def _check_coefficients(name: str, coefficients: NDArray[np.float64], components: int) -> None:
-    shape = coefficients.shape
-    if len(shape) != 3 or shape[0] < 1 or shape[1:] != (components, components):
-        raise RequestError(
-            f"{name}: coefficients {shape}; expected (order, {components}, {components})"
-        )

@@ -1,6 +1,6 @@
-"""The mouth centre in image coordinates.
+"""Interface of forecasters, the sequences they are fitted to, and the mouth centre.
 
-Legend: L = 468 landmarks.
+Legend: N sequences, T frames, H horizon, L = 468 landmarks.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+
+Array = NDArray[np.floating]
 
 _LIPS = list(LIPS)
 
@@ -49,20 +51,19 @@ def subject_folds(subjects: Sequence[str], folds: int) -> NDArray[np.int64]:
     return np.array([fold_of[subject] for subject in subjects], dtype=np.int64)
 
 
-Array = NDArray[np.floating]
-
-
 @dataclass(frozen=True)
 class LandmarkSequences:
-    """Sequences to fit a forecaster to, and whose they are.
+    """Sequences to fit a forecaster to, and their subjects.
+
+    Attributes:
+        landmarks: (N, T, L, 2), normalised to the crop of their sequence.
+        subjects: N names: the person of each sequence.
 
     Raises:
         RequestError: an array has another shape, or holds NaN or infinity.
     """
 
-    #: (N, T, L, 2) landmarks, normalised to the crop of their sequence
     landmarks: Array
-    #: N names: the person of each sequence
     subjects: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -79,10 +80,10 @@ class LandmarkSequences:
 class Forecaster(ABC):
     """A forecaster with its fitted parameters; subclasses are frozen dataclasses of them.
 
-    Every one promises (and the tests ask each that is registered): nothing after the history is
-    looked at; rows of a batch do not touch one another; a face that is moved as a whole is
-    forecast moved by as much; a shorter horizon gives the first frames of a longer one; any
-    history of one frame or more is enough, the face being taken to have been at rest before it.
+    Contract, tested for each registered forecaster: nothing after the history is read; rows of a
+    batch are independent; the forecast of a shifted face is shifted by as much; a shorter horizon
+    gives the first frames of a longer one; any history of one frame or more is enough, the face
+    being taken to have been at rest before it.
     """
 
     name: ClassVar[str]

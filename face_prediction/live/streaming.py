@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.history_images import dataset_picture
-from face_prediction.dataset.settings import SequenceSettings
+from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.prediction.interface import PictureNeeds, Predictor
-from face_prediction.prediction.predicted_motion import image_points
-from face_prediction.tracking.crop import Crop, crop_around
 from face_prediction.tracking.extract import MAX_GAP, SAME_TIME
+from face_prediction.tracking.geometry import Crop, crop_around, image_points
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
 

@@ -1,42 +1,94 @@
-"""Who is in a clip, where it is from, and whether numbers measured on it may be given away."""
+"""The library of recorded face motion: clips that may be redistributed, their runs, and its file.
+
+Attribution tables tell who is in a clip, where it is from, and whether numbers measured on it may
+be redistributed.
+
+Legend: N frames, R runs, H horizon.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from face_prediction.motion.motion import ClipMotion
-from face_prediction.tracking.geometry import continuous_quaternions
+from face_prediction.motion.motion import (
+    ClipMotion,
+    MotionSettings,
+    QualityLimits,
+    lift,
+    step_tremor,
+)
+from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES, continuous_quaternions
+from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.npz import Arrays, read_npz, require_array, write_npz
+from robo_manip_baselines.runs.npz import read_npz, require_array, require_json, write_npz
+
+SCHEMA = "recorded_face_motion"
+VERSION = 1
 
 COLUMNS = ("clip", "subject", "ship", "licence", "source")
+"""Columns of an attribution table."""
+
+CAMERA_MODEL = (
+    f"pinhole, {VERTICAL_FOV_DEGREES:g} degrees vertical field of view (assumed), principal point "
+    "in the middle of the image, square pixels; origin at the camera, x right in the image, y up, "
+    "z toward the camera; scale from MediaPipe's canonical face"
+)
+HEAD_POSE = (
+    "MediaPipe's fit of its canonical face, to the 25 of its 33 landmarks that do not move with "
+    "the mouth (brow, eyes, temples, nose)"
+)
+MOUTH_MODEL = (
+    "mean of the 40 lip landmarks, each on its image ray where that meets the plane through the "
+    "canonical mouth centre, normal to the head's z axis"
+)
+
+_ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
+    "fps": ("f", ()),
+    "time": ("f", ("N",)),
+    "mouth": ("f", ("N", 3)),
+    "orientation": ("f", ("N", 4)),
+    "jaw": ("f", ("N",)),
+    "run_start": ("iu", ("R",)),
+    "run_length": ("iu", ("R",)),
+    "run_clip": ("U", ("R",)),
+    "run_subject": ("U", ("R",)),
+    "predicted_mouth": ("f", ("N", "H", 3)),
+}
+"""Kind and shape of every array of the file; the last one may be absent."""
 
 
 @dataclass(frozen=True)
 class Attribution:
-    """One clip's row: its name without suffix, its person, and the terms it comes under."""
+    """Row of one clip.
+
+    Attributes:
+        clip: name without suffix.
+        subject: the person.
+        ship: numbers measured on the clip may be redistributed.
+        licence: terms of use.
+        source: origin.
+        kind: kind of footage, from the optional column ``kind``.
+        what: content, from the optional column ``what``.
+    """
 
     clip: str
     subject: str
-    #: whether numbers measured on the clip may be redistributed
     ship: bool
-    licence: str
-    source: str
-    #: kind of footage, from the optional column ``kind``
+    licence: str = "not stated"
+    source: str = "not stated"
     kind: str = ""
-    #: what is to be seen, from the optional column ``what``
     what: str = ""
 
     def record(self) -> dict[str, str]:
-        """What is kept in a library: everything but the clip's name and ``ship``."""
-        return {k: v for k, v in asdict(self).items() if k in ("subject", "licence", "source")}
+        """Subject, licence and source, which a library keeps."""
+        return {"subject": self.subject, "licence": self.licence, "source": self.source}
 
 
 def read_attributions(path: Path) -> dict[str, Attribution]:
@@ -54,90 +106,193 @@ def read_attributions(path: Path) -> dict[str, Attribution]:
     except (OSError, UnicodeDecodeError) as error:
         raise RequestError(f"--attribution {path}: cannot be read ({error})") from None
     lines = text.splitlines()
-    rows = list(csv.reader(lines)) if path.suffix == ".csv" else _markdown_rows(lines)
+    rows = csv.reader(lines) if path.suffix == ".csv" else _markdown_rows(lines)
     header: list[str] | None = None
+    is_found = False
     attributions: dict[str, Attribution] = {}
     for cells in rows:
-        if set(COLUMNS) <= {cell.lower() for cell in cells}:
-            header = [cell.lower() for cell in cells]
-        elif header is not None and len(cells) == len(header):
-            row = dict(zip(header, cells, strict=True))
-            attribution = _attribution(path, row)
-            if attribution.clip in attributions:
-                raise RequestError(f"--attribution {path}: two rows for '{attribution.clip}'")
-            attributions[attribution.clip] = attribution
-        elif header is not None and cells:
+        if cells is None:
+            header = None
+        elif set(COLUMNS) <= {cell.lower() for cell in cells}:
+            header, is_found = [cell.lower() for cell in cells], True
+        elif header is None or not cells:
+            continue
+        elif len(cells) != len(header):
             raise RequestError(
                 f"--attribution {path}: {len(cells)} cells for {len(header)} columns in the row "
                 f"of '{cells[0]}'"
             )
-    if header is None:
+        else:
+            row = dict(zip(header, cells, strict=True))
+            if missing := [name for name in COLUMNS if not row[name]]:
+                raise RequestError(
+                    f"--attribution {path}: row '{row['clip']}' has no {', '.join(missing)}"
+                )
+            if row["ship"].lower() not in ("yes", "no"):
+                raise RequestError(
+                    f"--attribution {path}: ship '{row['ship']}' in the row of '{row['clip']}'; "
+                    "yes or no"
+                )
+            clip = Path(row["clip"]).stem
+            if clip in attributions:
+                raise RequestError(f"--attribution {path}: two rows for '{clip}'")
+            kept = {name: row.get(name, "") for name in (*COLUMNS[3:], "kind", "what")}
+            ship = row["ship"].lower() == "yes"
+            attributions[clip] = Attribution(clip, row["subject"], ship, **kept)
+    if not is_found:
         raise RequestError(
             f"--attribution {path}: no table with the columns {', '.join(COLUMNS)} in it"
         )
     return attributions
 
 
-def _attribution(path: Path, row: dict[str, str]) -> Attribution:
-    missing = [name for name in COLUMNS if not row[name]]
-    if missing:
-        raise RequestError(f"--attribution {path}: row '{row['clip']}' has no {', '.join(missing)}")
-    ship = row["ship"].lower()
-    if ship not in ("yes", "no"):
-        raise RequestError(
-            f"--attribution {path}: ship '{row['ship']}' in the row of '{row['clip']}'; yes or no"
-        )
-    clip = Path(row["clip"]).stem
-    return Attribution(
-        clip,
-        row["subject"],
-        ship == "yes",
-        row["licence"],
-        row["source"],
-        kind=row.get("kind", ""),
-        what=row.get("what", ""),
-    )
-
-
-def _markdown_rows(lines: list[str]) -> list[list[str]]:
-    """Cells of the table lines that have the wanted columns; other tables are skipped."""
-    rows: list[list[str]] = []
-    inside = False
+def _markdown_rows(lines: Iterable[str]) -> Iterator[list[str] | None]:
+    """Cells of the lines of tables, without the rules below their headers; None for other text."""
     for line in lines:
         text = line.strip()
-        if not text.startswith("|"):
-            inside = False
-            continue
         cells = [cell.strip() for cell in text.strip("|").split("|")]
-        if set(COLUMNS) <= {cell.lower() for cell in cells}:
-            inside = True
-        elif set("".join(cells)) <= set("-: "):
-            continue  # the rule below the header
-        if inside:
-            rows.append(cells)
-    return rows
+        if not text.startswith("|"):
+            yield None
+        elif not set("".join(cells)) <= set("-: "):
+            yield cells
 
 
-SCHEMA = "recorded_face_motion"
-VERSION = 1
+def track_files(given: Iterable[Path]) -> list[Path]:
+    """The track files named, or in the folders named.
+
+    Raises:
+        RequestError: a path does not exist, a folder holds no track, or two share a clip's name.
+    """
+    found: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            inside = sorted(path.glob("*.npz"))
+            if not inside:
+                raise RequestError(f"{path}: no .npz file in it; make tracks with extract")
+            found += inside
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise RequestError(f"{path}: no such file or folder; make tracks with extract")
+    if not found:
+        raise RequestError("no track given; name a folder of tracks")
+    names = [path.stem for path in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise RequestError(f"two tracks named {', '.join(twice)}; each clip may be given once")
+    return found
+
+
+def attribution_of(
+    path: Path, rows: Mapping[str, Attribution] | None, table: Path | None
+) -> Attribution:
+    """The row of the clip of a track file; without a table, the clip is its own subject.
+
+    Raises:
+        RequestError: the table has no row for the clip.
+    """
+    if rows is None:
+        return Attribution(path.stem, path.stem, True)
+    if path.stem not in rows:
+        raise RequestError(f"{path}: no row for '{path.stem}' in {table}; add one (ship yes or no)")
+    return rows[path.stem]
+
+
+def refuse_other_files(out: Path) -> None:
+    """Check that ``out`` can be written and that nothing else is lost by it.
+
+    Raises:
+        RequestError: it is a folder, or a file of another kind.
+    """
+    if out.is_dir():
+        raise RequestError(f"--out {out}: is a folder; name a file")
+    if out.exists():
+        try:
+            read_npz(out, SCHEMA, VERSION)
+        except RequestError as error:
+            raise RequestError(f"{error}; it is in the way of --out, so remove it first") from None
 
 
 @dataclass(frozen=True)
-class MotionLibrary:
-    """Runs of recorded face motion. Camera frame: x right in the image, y up, z to the camera."""
+class LiftedClip:
+    """One clip of a library.
+
+    Attributes:
+        path: file of its track.
+        row: its attribution.
+        motion: lifted from the track.
+        detector: record of the track's detector.
+        video_sha256: of the video that the track was made from.
+    """
+
+    path: Path
+    row: Attribution
+    motion: ClipMotion
+    detector: dict[str, Any]
+    video_sha256: str
+
+
+def lift_clips(
+    tracks: Iterable[Path],
+    table: Path | None,
+    settings: MotionSettings,
+    only: Collection[str] | None = None,
+) -> tuple[list[LiftedClip], int]:
+    """Lift the clips that may ship, and count those that may not.
+
+    Args:
+        tracks: files, or folders of files.
+        table: attributions; None: all may ship.
+        settings: of the motion.
+        only: names of clips to lift; None: all that may ship.
+
+    Raises:
+        RequestError: a track has no row or cannot be used.
+    """
+    rows = None if table is None else read_attributions(table)
+    clips: list[LiftedClip] = []
+    withheld = 0
+    for path in track_files(tracks):
+        row = attribution_of(path, rows, table)
+        if not row.ship:
+            withheld += 1
+        elif only is None or row.clip in only:
+            track = load_track(path)
+            motion = lift(track, settings)
+            video = str(track.source.get("sha256", ""))
+            clips.append(LiftedClip(path, row, motion, dict(track.detector), video))
+    return clips, withheld
+
+
+@dataclass(frozen=True)
+class RecordedMotion:
+    """Runs of recorded face motion. Camera frame: x right in the image, y up, z to the camera.
+
+    Attributes:
+        fps: frames per second.
+        time: (N,) s from the start of the run.
+        mouth: (N, 3) float32 m, mouth centre in the camera frame.
+        orientation: (N, 4) float32 wxyz, camera from head.
+        jaw: (N,) float32 m between the inner lips.
+        run_start: (R,) int64, first frame of the run.
+        run_length: (R,) int64 frames.
+        run_clip: (R,) names.
+        run_subject: (R,) names.
+        metadata: what the library was made of, how, and what was cut.
+        predicted_mouth: (N, H, 3) float32 m: forecasts of the mouth 1 ... H frames after each
+            frame, in the frame of ``mouth``; None: no forecasts.
+    """
 
     fps: float
-    time: np.ndarray  # (N,) s from the start of the run
-    mouth: np.ndarray  # (N, 3) float32 m, mouth centre in the camera frame
-    orientation: np.ndarray  # (N, 4) float32 wxyz, camera from head
-    jaw: np.ndarray  # (N,) float32 m between the inner lips
-    run_start: np.ndarray  # (R,) int64, first frame of the run
-    run_length: np.ndarray  # (R,) int64 frames
-    run_clip: np.ndarray  # (R,) names
-    run_subject: np.ndarray  # (R,) names
+    time: np.ndarray
+    mouth: np.ndarray
+    orientation: np.ndarray
+    jaw: np.ndarray
+    run_start: np.ndarray
+    run_length: np.ndarray
+    run_clip: np.ndarray
+    run_subject: np.ndarray
     metadata: dict[str, Any]
-    #: (N, H, 3) float32 m: where the mouth was forecast to be 1 ... H frames after each frame, in
-    #: the frame of ``mouth``; None: nothing was forecast
     predicted_mouth: np.ndarray | None = None
 
     @property
@@ -150,10 +305,80 @@ class MotionLibrary:
         start = int(self.run_start[index])
         return slice(start, start + int(self.run_length[index]))
 
+    def summary(self) -> str:
+        """One line: seconds, runs, subjects and the shortest run."""
+        subjects = len(set(self.run_subject.tolist()))
+        shortest = float(np.min(self.run_length - 1)) / self.fps
+        return (
+            f"{self.seconds:.1f} s in {len(self.run_start)} runs of {subjects} subjects, "
+            f"the shortest {shortest:.1f} s"
+        )
 
-def build_library(
+    def settings(self) -> MotionSettings:
+        """Settings that the library was made with.
+
+        Raises:
+            RequestError: its metadata hold none.
+        """
+        try:
+            stored = dict(self.metadata["settings"])
+            limits = QualityLimits(**stored.pop("limits"))
+            return MotionSettings(limits=limits, **stored)
+        except (KeyError, TypeError, ValueError) as error:
+            raise RequestError(
+                f"--library: its metadata hold no settings of export-motion ({error}); "
+                "make it again"
+            ) from None
+
+
+def record_motion(
+    clips: Sequence[LiftedClip], settings: MotionSettings, withheld: int
+) -> RecordedMotion:
+    """Put the runs of clips into a library, with their attribution and what was cut.
+
+    Raises:
+        RequestError: no clip has a run, or the clips differ in rate.
+    """
+    detectors: list[dict[str, Any]] = []
+    for clip in clips:
+        if clip.detector not in detectors:
+            detectors.append(clip.detector)
+    metadata = {
+        "camera_model": CAMERA_MODEL,
+        "head_pose": HEAD_POSE,
+        "mouth": MOUTH_MODEL,
+        "settings": asdict(settings),
+        "detectors": detectors,
+        "attribution": {clip.row.clip: clip.row.record() for clip in clips if clip.motion.runs},
+        "clips": {c.row.clip: motion_statistics(c.motion, c.row.subject) for c in clips},
+        "withheld_clips": withheld,
+        "versions": {"numpy": np.__version__, "library_schema": VERSION},
+    }
+    return join_runs([(c.row.clip, c.row.subject, c.motion) for c in clips], metadata)
+
+
+def motion_statistics(motion: ClipMotion, subject: str) -> dict[str, Any]:
+    """Counts of frames of one clip, tremor in mm, speeds in cm/s of what is kept."""
+    row: dict[str, Any] = {"subject": subject, **motion.counts()}
+    row["seconds"] = round(motion.seconds, 2)
+    row["depth_smoothed"] = motion.depth_smoothed
+    row["distance_m"] = round(float(-np.nanmedian(motion.raw_depth)), 3)
+    row["raw_depth_tremor_mm"] = round(1000 * step_tremor(motion.raw_depth), 2)
+    if motion.runs:
+        kept = [motion.mouth[a:b] for a, b in motion.runs]
+        steps = np.concatenate([np.diff(part, axis=0) for part in kept])
+        speed = np.linalg.norm(steps, axis=1) * motion.fps * 100
+        row["speed_median_cm_s"] = round(float(np.median(speed)), 1)
+        row["speed_p95_cm_s"] = round(float(np.percentile(speed, 95)), 1)
+        row["tremor_mm"] = [
+            round(1000 * max(step_tremor(part[:, axis]) for part in kept), 2) for axis in range(3)
+        ]
+    return row
+
+
+def join_runs(
     clips: Sequence[tuple[str, str, ClipMotion]], metadata: dict[str, Any]
-) -> MotionLibrary:
+) -> RecordedMotion:
     """Put the runs of (clip, subject, motion) one after another.
 
     Raises:
@@ -173,13 +398,12 @@ def build_library(
         )
     fps = rates.pop()
     lengths = np.array([part.stop - part.start for *_, part in parts], dtype=np.int64)
-    return MotionLibrary(
+    orientations = [continuous_quaternions(m.orientation[part]) for _, _, m, part in parts]
+    return RecordedMotion(
         fps=fps,
         time=np.concatenate([np.arange(n) / fps for n in lengths]),
         mouth=np.concatenate([m.mouth[part] for _, _, m, part in parts]).astype(np.float32),
-        orientation=np.concatenate(
-            [continuous_quaternions(m.orientation[part]) for _, _, m, part in parts]
-        ).astype(np.float32),
+        orientation=np.concatenate(orientations).astype(np.float32),
         jaw=np.concatenate([m.jaw[part] for _, _, m, part in parts]).astype(np.float32),
         run_start=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64),
         run_length=lengths,
@@ -189,77 +413,50 @@ def build_library(
     )
 
 
-def save_library(path: Path, library: MotionLibrary) -> None:
-    """Write ``library`` to ``path``, whole or not at all."""
-    arrays = {
-        "schema": np.array(SCHEMA),
-        "version": np.array(VERSION),
-        "fps": np.array(library.fps, dtype=np.float64),
-        "time": library.time,
-        "mouth": library.mouth,
-        "orientation": library.orientation,
-        "jaw": library.jaw,
-        "run_start": library.run_start,
-        "run_length": library.run_length,
-        "run_clip": library.run_clip,
-        "run_subject": library.run_subject,
-        "metadata": np.array(json.dumps(library.metadata, sort_keys=True)),
-    }
-    if library.predicted_mouth is not None:
-        arrays["predicted_mouth"] = library.predicted_mouth
+def save_motion(path: Path, motion: RecordedMotion) -> None:
+    """Write ``motion`` to ``path``, whole or not at all."""
+    arrays = {"schema": np.array(SCHEMA), "version": np.array(VERSION)}
+    for name in (*list(_ARRAYS)[:-1], "metadata", "predicted_mouth"):
+        value = getattr(motion, name)
+        if name == "metadata":
+            value = json.dumps(value, sort_keys=True)
+        if value is not None:
+            arrays[name] = np.asarray(value)
     write_npz(path, arrays)
 
 
-def load_library(path: Path) -> MotionLibrary:
+def load_motion(path: Path) -> RecordedMotion:
     """Read and check the library at ``path``.
 
     Raises:
-        RequestError: the file is absent, damaged, of another schema, or breaks a promise; the
-            message names the file and the key.
+        RequestError: the file is absent, damaged, of another schema, or its arrays do not agree;
+            the message names the file and the key.
     """
     arrays = read_npz(path, SCHEMA, VERSION)
-    time = require_array(path, arrays, "time", (None,), "f")
-    run_start = require_array(path, arrays, "run_start", (None,), "iu")
-    frames, runs = len(time), len(run_start)
-    try:
-        metadata = json.loads(str(require_array(path, arrays, "metadata", (), "U")))
-    except json.JSONDecodeError:
-        raise RequestError(f"{path}: 'metadata' is not JSON; make the file again") from None
-    library = MotionLibrary(
-        fps=float(require_array(path, arrays, "fps", (), "f")),
-        time=time,
-        mouth=require_array(path, arrays, "mouth", (frames, 3), "f"),
-        orientation=require_array(path, arrays, "orientation", (frames, 4), "f"),
-        jaw=require_array(path, arrays, "jaw", (frames,), "f"),
-        run_start=run_start,
-        run_length=require_array(path, arrays, "run_length", (runs,), "iu"),
-        run_clip=require_array(path, arrays, "run_clip", (runs,), "U"),
-        run_subject=require_array(path, arrays, "run_subject", (runs,), "U"),
-        metadata=metadata,
-        predicted_mouth=(
-            require_array(path, arrays, "predicted_mouth", (frames, None, 3), "f")
-            if "predicted_mouth" in arrays
-            else None
-        ),
-    )
-    _check(path, arrays, library)
-    return library
-
-
-def _check(path: Path, arrays: Arrays, library: MotionLibrary) -> None:
-    for key in ("fps", "time", "mouth", "orientation", "jaw", "predicted_mouth"):
-        if key in arrays and not np.all(np.isfinite(arrays[key])):
-            raise RequestError(f"{path}: '{key}' holds NaN or infinity")
-    ends = library.run_start + library.run_length
-    joined = np.concatenate([[0], ends])
+    lengths = {
+        "N": len(require_array(path, arrays, "time", (None,), "f")),
+        "R": len(require_array(path, arrays, "run_start", (None,), "iu")),
+        "H": None,
+    }
+    values: dict[str, Any] = {}
+    for name, (kind, shape) in _ARRAYS.items():
+        if name in arrays or name != "predicted_mouth":
+            sizes = tuple(lengths[n] if isinstance(n, str) else n for n in shape)
+            values[name] = require_array(path, arrays, name, sizes, kind)
+            if kind == "f" and not np.all(np.isfinite(values[name])):
+                raise RequestError(f"{path}: '{name}' holds NaN or infinity")
+    values["fps"] = float(values["fps"])
+    motion = RecordedMotion(**values, metadata=require_json(path, arrays, "metadata"))
+    joined = np.concatenate([[0], motion.run_start + motion.run_length])
     if (
-        len(library.run_start) == 0
-        or library.fps <= 0
-        or np.any(library.run_length < 2)
-        or not np.array_equal(joined[:-1], library.run_start)
-        or joined[-1] != len(library.time)
+        len(motion.run_start) == 0
+        or motion.fps <= 0
+        or np.any(motion.run_length < 2)
+        or not np.array_equal(joined[:-1], motion.run_start)
+        or joined[-1] != len(motion.time)
     ):
         raise RequestError(f"{path}: 'run_start' and 'run_length' do not divide the frames")
-    norms = np.linalg.norm(library.orientation.astype(float), axis=1)
+    norms = np.linalg.norm(motion.orientation.astype(float), axis=1)
     if np.any(np.abs(norms - 1) > 1e-5):  # float32 quaternions are unit to 1e-7
         raise RequestError(f"{path}: 'orientation' holds quaternions that are not of unit length")
+    return motion

@@ -1,6 +1,7 @@
-"""Where a lifted motion may be trusted: detector jumps, dropped faces, heads turned away.
+"""Motion of mouth, head and jaw lifted from a track, rated frame by frame and cut into runs.
 
-Nothing is repaired here. Frames and steps that fail are cut out, and counted.
+Detector jumps, dropped faces and heads turned away are not repaired. Frames and steps that fail are
+cut out, and counted.
 
 Legend: T frames; a step is the way from one frame to the next, so there are T - 1.
 """
@@ -8,60 +9,65 @@ Legend: T frames; a step is the way from one frame to the next, so there are T -
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from face_prediction.tracking.geometry import (
-    continuous_quaternions,
-    quaternion_from_matrix,
-    rigid_head_poses,
-    rotation_angle,
-)
-from face_prediction.tracking.lifting import jaw_openings, mouth_centres
+from face_prediction.tracking.geometry import continuous_quaternions, lift_landmarks, rotation_angle
 from face_prediction.tracking.tracks import FaceTrack
 from robo_manip_baselines.runs.errors import RequestError
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-#: Standard deviation of a normal distribution in units of its median absolute deviation.
 MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution in units of its median absolute deviation."""
+
+
+def _require_positive(settings: object, *names: str) -> None:
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise RequestError(f"--{name} {value}: must be positive")
 
 
 @dataclass(frozen=True)
 class QualityLimits:
-    """What a head can do; more than this is the detector's doing (docs/face_motion.md)."""
+    """Limits of human motion; anything beyond is an error of the detector (docs/face_motion.md).
 
-    #: m/s, mouth across the view
+    Attributes:
+        max_speed: m/s across the view; a faster mouth is a jump of the detector.
+        max_acceleration: m/s^2 of the mouth across the view; more is a spike.
+        max_turn_rate: degrees/s; a faster head is a jump.
+        max_jaw_speed: m/s between the lips; more is a jump.
+        depth_sigmas: A step in depth is a jump beyond max_speed and this many standard deviations
+            of the clip's own tremor in depth, which is measured by the size of the face and grows
+            as the face gets smaller.
+        max_rotation: Degrees between the head and facing the camera.
+    """
+
     max_speed: float = 0.6
-    #: m/s^2, mouth across the view
     max_acceleration: float = 15.0
-    #: degrees/s, head
     max_turn_rate: float = 400.0
-    #: m/s, lips apart or together
     max_jaw_speed: float = 0.6
-    #: Depth is measured by the size of the face and trembles more the smaller it is: a step in
-    #: depth is a jump beyond max_speed and this many standard deviations of the clip's own tremor.
     depth_sigmas: float = 4.0
-    #: degrees between the head and facing the camera
     max_rotation: float = 35.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (np.isfinite(value) and value > 0):
-                raise RequestError(f"--{name} {value}: must be positive")
+        _require_positive(self, *vars(self))
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Verdict on every frame and step of one motion."""
+    """Quality of every frame and step of one motion.
 
-    #: (T,) bool: a face was found and its mouth could be placed
+    Attributes:
+        found: (T,) bool: a face was found and its mouth could be placed.
+        spike: (T,) bool: the frame is the top of a spike.
+        jump: (T - 1,) bool: the step is a jump.
+        turned_away: (T,) bool: the head is turned away too far.
+    """
+
     found: np.ndarray
-    #: (T,) bool: the frame is the top of a spike
     spike: np.ndarray
-    #: (T - 1,) bool: the step is a jump
     jump: np.ndarray
-    #: (T,) bool: the head is turned away too far
     turned_away: np.ndarray
 
     def segments(self) -> list[tuple[int, int]]:
@@ -76,7 +82,7 @@ class Quality:
 def assess(
     mouth: np.ndarray, orientation: np.ndarray, jaw: np.ndarray, fps: float, limits: QualityLimits
 ) -> Quality:
-    """Judge a motion: mouth (T, 3) m, orientation (T, 4) wxyz, jaw (T,) m; NaN where lost."""
+    """Rate a motion: mouth (T, 3) m, orientation (T, 4) wxyz, jaw (T,) m; NaN where lost."""
     found = np.isfinite(mouth).all(axis=1) & np.isfinite(jaw) & np.isfinite(orientation).all(axis=1)
     velocity = np.diff(mouth, axis=0) * fps
     across = np.linalg.norm(velocity[:, :2], axis=1)
@@ -112,21 +118,14 @@ def tremor(values: np.ndarray) -> float:
 
 def stretches(good: np.ndarray, broken_step: np.ndarray) -> list[tuple[int, int]]:
     """[start, stop) of every longest stretch of ``good`` (T,) frames without a broken step."""
-    result: list[tuple[int, int]] = []
-    start: int | None = None
-    for index, frame_good in enumerate(good):
-        if start is not None and (not frame_good or broken_step[index - 1]):
-            result.append((start, index))
-            start = None
-        if start is None and frame_good:
-            start = index
-    if start is not None:
-        result.append((start, len(good)))
-    return result
+    joined = good[1:] & good[:-1] & ~broken_step  # (T - 1,) both frames are in one stretch
+    starts = np.flatnonzero(good & ~np.concatenate([[False], joined]))
+    stops = np.flatnonzero(good & ~np.concatenate([joined, [False]])) + 1
+    return list(zip(starts.tolist(), stops.tolist(), strict=True))
 
 
 def permitted_starts(mouth: np.ndarray, window: int, max_displacement: float) -> np.ndarray:
-    """(T - W + 1,) bool: from which frames a window of W frames stays within reach.
+    """(T - W + 1,) bool: a window of W frames from this frame stays within reach.
 
     Within reach: no axis of ``mouth`` (T, 3) goes further than ``max_displacement`` metres from
     where it was in the window's first frame.
@@ -177,75 +176,116 @@ def longest_runs(permitted: np.ndarray, window: int) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """How motion is lifted, judged and cut; recorded in the library."""
+    """Settings of lifting, rating and cutting motion; recorded in the library.
+
+    Attributes:
+        limits: Limits of human motion.
+        min_run: Seconds of an episode: runs are at least this long, and from every start that
+            leaves this much, the mouth stays within reach.
+        max_displacement: Reach in metres on each axis from where an episode starts.
+        depth_cutoff: Hz (-3 dB) of the low-pass on the depth of clips that need it; None: keep
+            every depth as measured.
+        max_depth_tremor: Metres: clips whose depth trembles more than this from frame to frame get
+            the low-pass.
+    """
 
     limits: QualityLimits = field(default_factory=QualityLimits)
-    #: seconds of an episode: the shortest run, and the window that must stay within reach
     min_run: float = 12.0
-    #: metres on each axis from where a window starts
     max_displacement: float = 0.08
-    #: Hz (-3 dB) of the low-pass on the depth of clips that need it; None: never
     depth_cutoff: float | None = 3.0
-    #: metres: clips whose depth trembles more than this from frame to frame need it
     max_depth_tremor: float = 0.001
 
     def __post_init__(self) -> None:
-        for name in ("min_run", "max_displacement", "depth_cutoff", "max_depth_tremor"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise RequestError(f"--{name} {value}: must be positive")
+        _require_positive(self, "min_run", "max_displacement", "depth_cutoff", "max_depth_tremor")
 
 
 @dataclass(frozen=True)
 class ClipMotion:
-    """The motion of one clip, and what of it is kept."""
+    """Motion of one clip, and the runs of it that are kept.
+
+    Attributes:
+        fps: frames per second.
+        timestamps: (T,) s.
+        mouth: (T, 3) m, camera frame; NaN where lost.
+        raw_depth: (T,) m, z before any low-pass.
+        orientation: (T, 4) wxyz, camera from head.
+        jaw: (T,) m between the inner lips.
+        quality: of frames and steps.
+        depth_smoothed: the depth was low-passed.
+        window: frames of an episode.
+        runs: [start, stop) of each run.
+    """
 
     fps: float
-    timestamps: np.ndarray  # (T,) s
-    mouth: np.ndarray  # (T, 3) m, camera frame; NaN where lost
-    raw_depth: np.ndarray  # (T,) m, z before any low-pass
-    orientation: np.ndarray  # (T, 4) wxyz, camera from head
-    jaw: np.ndarray  # (T,) m
+    timestamps: np.ndarray
+    mouth: np.ndarray
+    raw_depth: np.ndarray
+    orientation: np.ndarray
+    jaw: np.ndarray
     quality: Quality
     depth_smoothed: bool
-    window: int  # frames of an episode
-    runs: list[tuple[int, int]]  # [start, stop)
-    counts: dict[str, Any]  # what was cut and why
+    window: int
+    runs: list[tuple[int, int]]
+
+    @property
+    def seconds(self) -> float:
+        """Continuous motion kept: the time from first to last frame, summed over runs."""
+        return sum(stop - start - 1 for start, stop in self.runs) / self.fps
+
+    def frame_classes(self) -> dict[str, np.ndarray]:
+        """Masks (T,) of frames by what became of them; every frame is in one of them."""
+        quality = self.quality
+        kept, short, rest = np.zeros((3, len(self.timestamps)), dtype=bool)
+        for start, stop in self.runs:
+            kept[start:stop] = True
+        for start, stop in quality.facing_segments():
+            (short if stop - start < self.window else rest)[start:stop] = True
+        spike = quality.spike & quality.found
+        return {
+            "kept": kept,
+            "no_face": ~quality.found,
+            "spike": spike,
+            "turned_away": quality.turned_away & quality.found & ~spike,
+            "too_short": short,
+            "out_of_reach": rest & ~kept,
+        }
+
+    def counts(self) -> dict[str, int]:
+        """Frames by what became of them, jumps and runs."""
+        return {
+            "frames": len(self.timestamps),
+            **{name: int(mask.sum()) for name, mask in self.frame_classes().items()},
+            "jumps": int(self.quality.jump.sum()),
+            "runs": len(self.runs),
+        }
 
 
 def lift(track: FaceTrack, settings: MotionSettings) -> ClipMotion:
-    """Lift ``track`` to metres, judge every frame, and choose the runs to keep.
+    """Lift ``track`` to metres, rate every frame, and choose the runs to keep.
 
     Raises:
         RequestError: the track's frames are not at a constant rate.
     """
-    if not has_constant_rate(track):
+    if not track.has_constant_rate:
         raise RequestError(
             f"{track.source.get('name', 'track')}: its frames are not at a constant rate; "
             "extract it with --fps 30"
         )
-    landmarks = track.landmarks.astype(float)
-    head_pose = rigid_head_poses(landmarks, track.valid, track.image_size)
-    mouth = mouth_centres(landmarks, head_pose, track.image_size)
-    jaw = jaw_openings(landmarks, head_pose, track.image_size)
-    orientation = np.full((len(track), 4), np.nan)
-    valid = track.valid
-    orientation[valid] = quaternion_from_matrix(head_pose[valid, :3, :3])
+    mouth, orientation, jaw = lift_landmarks(track.landmarks, track.valid, track.image_size)
     quality = assess(mouth, orientation, jaw, track.fps, settings.limits)
     raw_depth = mouth[:, 2].copy()
     shaky = step_tremor(raw_depth) > settings.max_depth_tremor
-    smoothed = settings.depth_cutoff is not None and shaky
+    cutoff = settings.depth_cutoff if shaky else None
     for start, stop in quality.segments():
         part = slice(start, stop)
         orientation[part] = continuous_quaternions(orientation[part])
-        if smoothed and settings.depth_cutoff is not None:
-            mouth[part] = smooth_depth(mouth[part], settings.depth_cutoff / track.fps)
+        if cutoff is not None:
+            mouth[part] = smooth_depth(mouth[part], cutoff / track.fps)
     window = round(settings.min_run * track.fps) + 1
     runs: list[tuple[int, int]] = []
     for start, stop in quality.facing_segments():
         permitted = permitted_starts(mouth[start:stop], window, settings.max_displacement)
         runs += [(start + a, start + b) for a, b in longest_runs(permitted, window)]
-    counts = count_cuts(quality, runs, window)
     return ClipMotion(
         fps=track.fps,
         timestamps=track.timestamps,
@@ -254,16 +294,10 @@ def lift(track: FaceTrack, settings: MotionSettings) -> ClipMotion:
         orientation=orientation,
         jaw=jaw,
         quality=quality,
-        depth_smoothed=smoothed,
+        depth_smoothed=cutoff is not None,
         window=window,
         runs=runs,
-        counts=counts,
     )
-
-
-def has_constant_rate(track: FaceTrack) -> bool:
-    """Whether frames are 1 / fps apart, to a millisecond (container clocks tick that coarsely)."""
-    return bool(np.all(np.abs(np.diff(track.timestamps) - 1 / track.fps) < 1e-3))
 
 
 def step_tremor(depth: np.ndarray) -> float:
@@ -286,28 +320,3 @@ def smooth_depth(mouth: np.ndarray, cutoff: float) -> np.ndarray:
     padded = np.pad(mouth[:, 2], reach, mode="reflect", reflect_type="odd")
     depth = np.convolve(padded, kernel / kernel.sum(), mode="valid")
     return mouth * (depth / mouth[:, 2])[:, None]
-
-
-def count_cuts(quality: Quality, runs: list[tuple[int, int]], window: int) -> dict[str, int]:
-    """Frames of the clip by what became of them; the five add up to all of them."""
-    kept = np.zeros(len(quality.found), dtype=bool)
-    for start, stop in runs:
-        kept[start:stop] = True
-    lost = ~quality.found
-    spike = quality.spike & ~lost
-    turned = quality.turned_away & ~lost & ~spike
-    short = np.zeros_like(kept)
-    reachless = np.zeros_like(kept)
-    for start, stop in quality.facing_segments():
-        (short if stop - start < window else reachless)[start:stop] = True
-    return {
-        "frames": len(kept),
-        "kept": int(kept.sum()),
-        "no_face": int(lost.sum()),
-        "spike": int(spike.sum()),
-        "turned_away": int(turned.sum()),
-        "too_short": int(short.sum()),
-        "out_of_reach": int((reachless & ~kept).sum()),
-        "jumps": int(quality.jump.sum()),
-        "runs": len(runs),
-    }

@@ -1,8 +1,8 @@
-"""What everything that forecasts faces offers to those who judge it, export it or run it live.
+"""Interface of predictors of faces, which are evaluated, exported or run live.
 
 Coordinates are normalised to the square crop of a sequence: u right and v down, 0 to 1.
-Legend: B histories, T frames of history, H horizon, L = 468 landmarks, S side of the pictures,
-P pictures at the end of the history.
+Legend: B histories, T frames of history, H horizon, L = 468 landmarks, S side of the images,
+P images at the end of the history.
 """
 
 from __future__ import annotations
@@ -16,34 +16,41 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class PictureNeeds:
-    """Which pictures of a history a predictor looks at: the last ``frames``, of side ``size``."""
+    """Images of the history that a predictor needs.
 
-    #: 0: none
+    Attributes:
+        frames: how many, from the end of the history; 0: none.
+        size: their side in pixels; 256, or a half, a quarter or an eighth of it.
+    """
+
     frames: int
-    #: pixels; 256, or a half, a quarter or an eighth of it
     size: int
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is forecast for the H frames after each of B histories."""
+    """Forecast of the H frames after each of B histories.
 
-    #: (B, H, L, 2) float32; NaN where there is no forecast
+    Attributes:
+        landmarks: (B, H, L, 2) float32; NaN where there is no forecast.
+        pictures: (B, H, S, S, 3) uint8 RGB; None: the predictor makes no images.
+        mouth_scale: (B, H, 2) scale of the error of the mouth centre along U and V; None: the
+            predictor gives no intervals.
+        degrees_of_freedom: (H, 2) degrees of freedom of that Student-t error; infinite: a Gaussian.
+    """
+
     landmarks: NDArray[np.float32]
-    #: (B, H, S, S, 3) uint8 RGB; None: this predictor makes no pictures
     pictures: NDArray[np.uint8] | None = None
-    #: (B, H, 2) scale of the error of the mouth centre along U and V; None: it gives no intervals
     mouth_scale: NDArray[np.float32] | None = None
-    #: (H, 2) degrees of freedom of that Student-t error; infinite: a Gaussian
     degrees_of_freedom: NDArray[np.float64] | None = None
 
 
 class Predictor(Protocol):
-    """Anything that forecasts: a baseline, or a trained network."""
+    """A baseline or a trained network that forecasts faces."""
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         ...
 
     @property
@@ -53,7 +60,7 @@ class Predictor(Protocol):
 
     @property
     def needs(self) -> PictureNeeds:
-        """Which pictures it looks at."""
+        """Images of the history that it needs."""
         ...
 
     def predict(
@@ -66,8 +73,8 @@ class Predictor(Protocol):
 
         Args:
             landmarks: (B, T, L, 2), the newest last, 30 a second.
-            pictures: (B, P, S, S, 3) uint8 RGB of the last P frames, as `needs` says; None where
-                it needs none.
+            pictures: (B, P, S, S, 3) uint8 RGB of the last P frames, see `needs`; None where it
+                needs none.
             horizon: 1 or more; a trained network has a longest one.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Where MediaPipe's face landmarker model is, and how it gets there."""
+"""MediaPipe's face landmarker: its model file, its settings, and faces in images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import logging
 import os
 import sys
 import tempfile
-import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,20 +16,23 @@ from typing import Any, Literal
 
 import numpy as np
 
+from face_prediction.tracking.geometry import CENTIMETRE
 from face_prediction.tracking.tracks import NUM_LANDMARKS
-from face_prediction.tracking.video import sha256_of
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file, file_digest
 
 logger = logging.getLogger(__name__)
 
 MODEL_NAME = "face_landmarker.task"
-#: MediaPipe's model page, "Face Landmarker", float16, version 1 (Apache-2.0).
 MODEL_URL = (
     "https://storage.googleapis.com/mediapipe-models/face_landmarker/face_landmarker/"
     "float16/1/face_landmarker.task"
 )
+"""MediaPipe's model page, "Face Landmarker", float16, version 1 (Apache-2.0)."""
 MODEL_SHA256 = "64184e229b263107bc2b804c6625db1341ff2bb731874b0bcc2fe6544e0bc9ff"
 TIMEOUT_S = 30.0
+
+RunningMode = Literal["image", "video"]
 
 
 def default_model_path() -> Path:
@@ -51,55 +53,50 @@ def find_model(given: Path | None, url: str = MODEL_URL, expected: str = MODEL_S
             raise RequestError(f"--model {given}: no such file; download it from {MODEL_URL}")
         return given
     path = default_model_path()
-    if not path.is_file():
-        _download(url, path, expected)
-    elif sha256_of(path) != expected:
-        raise RequestError(f"{path}: not the expected file (sha256 differs); delete it, try again")
-    return path
-
-
-def _download(url: str, path: Path, expected: str) -> None:
+    if path.is_file():
+        if file_digest(path) != expected:
+            raise RequestError(
+                f"{path}: not the expected file (sha256 differs); delete it, try again"
+            )
+        return path
     try:
         with urllib.request.urlopen(url, timeout=TIMEOUT_S) as response:
             logger.info("downloading %s to %s", url, path)
             data = response.read()
-    except (urllib.error.URLError, OSError) as error:
-        reason = getattr(error, "reason", error)
+    except OSError as error:  # URLError is one
         raise RequestError(
-            f"no model at {path} and none could be downloaded ({reason}); on a machine with a "
-            f"network fetch {url}, then put it there or name it with --model"
+            f"no model at {path} and none could be downloaded ({getattr(error, 'reason', error)}); "
+            f"on a machine with a network fetch {url}, then put it there or name it with --model"
         ) from None
     found = hashlib.sha256(data).hexdigest()
     if found != expected:
         raise RequestError(f"{url}: sha256 {found}, expected {expected}; nothing was kept")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-        Path(name).replace(path)
-    except OSError as error:
+        with atomic_file(path) as temporary:
+            temporary.write_bytes(data)
+    except (OSError, RequestError) as error:
         raise RequestError(
-            f"{path}: cannot be written ({error.strerror}); name a model with --model"
+            f"{path}: cannot be written ({error}); name a model with --model"
         ) from None
-
-
-RunningMode = Literal["image", "video"]
-CENTIMETRE = 0.01
+    return path
 
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """How the detector runs; recorded in every track."""
+    """Settings of the detector; recorded in every track.
 
-    #: image: every frame on its own, the unsmoothed estimate. video: MediaPipe follows one face
-    #: and low-passes its landmarks.
+    Attributes:
+        running_mode: image: every frame on its own, unsmoothed. video: MediaPipe follows one face
+            and low-passes its landmarks.
+        num_faces: Faces looked for in a frame, so that the tracked one is among them (image mode).
+        min_detection_confidence: Least score of the face detector. MediaPipe's default.
+        min_presence_confidence: Least score of the landmark network's "a face is present".
+            MediaPipe's default.
+    """
+
     running_mode: RunningMode = "image"
-    #: Faces looked for in a frame (image mode), so that the tracked one is among them.
     num_faces: int = 4
-    #: Least score of the face detector, MediaPipe's default.
     min_detection_confidence: float = 0.5
-    #: Least score of "a face is present" of the landmark network, MediaPipe's default.
     min_presence_confidence: float = 0.5
 
     def __post_init__(self) -> None:
@@ -119,6 +116,12 @@ class FaceDetection:
     landmarks: np.ndarray
     head_pose: np.ndarray
 
+    def box(self, image_size: tuple[int, int]) -> tuple[np.ndarray, float]:
+        """Middle (2,) and width of the box around the face, in pixels."""
+        points = self.landmarks[:, :2] * image_size
+        low, high = points.min(axis=0), points.max(axis=0)
+        return (low + high) / 2, float(high[0] - low[0])
+
 
 class FaceDetector:
     """Finds faces in RGB images. Use as a context manager; :meth:`close` frees the native graph.
@@ -128,18 +131,24 @@ class FaceDetector:
     """
 
     def __init__(self, model: Path, settings: DetectorSettings) -> None:
-        vision, base_options, self._mediapipe = _import_mediapipe()
+        try:
+            with native_stderr_silenced():
+                import mediapipe
+                from mediapipe.tasks.python import BaseOptions, vision
+        except ImportError as error:
+            raise RequestError(
+                f"MediaPipe cannot be imported ({error}); "
+                "pip install 'robo_manip_baselines[face_prediction]'"
+            ) from None
+        self._mediapipe: Any = mediapipe
         self._settings = settings
+        self._follows = settings.running_mode == "video"
         self.model = model
-        mode = vision.RunningMode.IMAGE
-        faces = settings.num_faces
-        if settings.running_mode == "video":
-            mode = vision.RunningMode.VIDEO
-            faces = 1  # with more, MediaPipe detects anew in every frame and does not smooth
         options = vision.FaceLandmarkerOptions(
-            base_options=base_options(model_asset_path=str(model)),
-            running_mode=mode,
-            num_faces=faces,
+            base_options=BaseOptions(model_asset_path=str(model)),
+            running_mode=vision.RunningMode.VIDEO if self._follows else vision.RunningMode.IMAGE,
+            # with more, MediaPipe detects in every frame of a video and does not smooth
+            num_faces=1 if self._follows else settings.num_faces,
             min_face_detection_confidence=settings.min_detection_confidence,
             min_face_presence_confidence=settings.min_presence_confidence,
             output_facial_transformation_matrixes=True,
@@ -175,14 +184,17 @@ class FaceDetector:
         # the inference threads announce themselves on the first image
         quiet = contextlib.nullcontext() if self._warm else native_stderr_silenced()
         with quiet:
-            if self._settings.running_mode == "video":
+            if self._follows:
                 result = self._landmarker.detect_for_video(mp_image, round(time * 1000))
             else:
                 result = self._landmarker.detect(mp_image)
         self._warm = True
+        in_metres = np.ones((4, 4))
+        in_metres[:3, 3] = CENTIMETRE
         return [
             FaceDetection(
-                np.array([(p.x, p.y, p.z) for p in points[:NUM_LANDMARKS]]), _in_metres(matrix)
+                np.array([(p.x, p.y, p.z) for p in points[:NUM_LANDMARKS]]),
+                np.array(matrix, dtype=float) * in_metres,
             )
             for points, matrix in zip(
                 result.face_landmarks, result.facial_transformation_matrixes, strict=True
@@ -190,33 +202,14 @@ class FaceDetector:
         ]
 
     def description(self) -> dict[str, Any]:
-        """What found the faces, for the record kept in a track."""
+        """Detector, model and settings, for the record kept in a track."""
         return {
             "name": "MediaPipe FaceLandmarker",
             "version": self._mediapipe.__version__,
-            "model_sha256": sha256_of(self.model),
-            "smoothed": self._settings.running_mode == "video",
+            "model_sha256": file_digest(self.model),
+            "smoothed": self._follows,
             **vars(self._settings),
         }
-
-
-def _in_metres(matrix: np.ndarray) -> np.ndarray:
-    pose = np.array(matrix, dtype=float)
-    pose[:3, 3] *= CENTIMETRE
-    return pose
-
-
-def _import_mediapipe() -> tuple[Any, Any, Any]:
-    try:
-        with native_stderr_silenced():
-            import mediapipe
-            from mediapipe.tasks.python import BaseOptions, vision
-    except ImportError as error:
-        raise RequestError(
-            f"MediaPipe cannot be imported ({error}); "
-            "pip install 'robo_manip_baselines[face_prediction]'"
-        ) from None
-    return vision, BaseOptions, mediapipe
 
 
 @contextlib.contextmanager
@@ -224,7 +217,7 @@ def native_stderr_silenced() -> Iterator[None]:
     """Send what native code writes to descriptor 2 to a file while the block runs.
 
     MediaPipe, absl and TensorFlow Lite announce their set-up there before any of their own logging
-    switches works. What was written is shown when the block fails.
+    switches works. It is written out when the block fails.
     """
     try:
         saved = os.dup(2)

@@ -1,37 +1,94 @@
-"""Decoded frames at their own times to a constant rate, without bridging a gap.
+"""Videos to face tracks: one face followed and brought to a constant rate.
+
+Small faces are detected through a window of the frame (`ZoomingDetector`), one person is followed
+(`FaceFollower`), and the detections, made at the times of the decoded frames, are resampled to a
+constant rate without bridging a gap (`resample`).
 
 Legend: S source frames, T frames, L landmarks.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from face_prediction.tracking.detector import DetectorSettings, FaceDetection, FaceDetector
 from face_prediction.tracking.geometry import (
     CanonicalFace,
+    Crop,
     head_pose_from_landmarks,
+    jaw_openings,
     matrix_from_quaternion,
     quaternion_from_matrix,
     read_canonical_face,
     slerp,
 )
-from face_prediction.tracking.lifting import jaw_openings
 from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, load_track
-from face_prediction.tracking.video import VideoFrame, VideoReader, sha256_of
+from face_prediction.tracking.video import VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
-#: Two decoded frames further apart than this are a gap: at 0.1 s a mouth at the median speed
-#: (1-4 cm/s) has gone 4 mm, and nothing says which way.
+DEFAULT_FPS = 30.0
+"""Rate of the paper's recordings (IV.B)."""
 MAX_GAP = 0.1
-#: A frame nearer than this to a decoded one is that frame (video clocks tick in 1/90000 s or more).
+"""Seconds: two decoded frames further apart than this are a gap. In 0.1 s a mouth at the median
+speed (1-4 cm/s) has gone 4 mm, in an unknown direction."""
 SAME_TIME = 1e-3
+"""A frame nearer than this to a decoded one is that frame (video clocks tick in 1/90000 s or
+more)."""
+
+SMALL_FACE = 0.2
+"""Faces narrower than this share of the frame's longer side are detected through a window."""
+WINDOW_FACES = 3.0
+"""Side of the window in face widths."""
+OFF_CENTRE = 0.2
+"""The window moves when the face's middle is further than this share of its side from its own."""
+SIZE_CHANGE = 1.4
+"""The window changes its size when the face's width has changed by this factor."""
+SEARCH_INTERVAL = 0.5
+"""Seconds without a face before a search, and between searches."""
+
+SAME_FACE_DISTANCE = 0.75
+"""A face whose middle is further than this from where the tracked one was, in face widths, is
+another person. A mouth at 0.6 m/s crosses a seventh of a face between frames at 30 fps."""
+LOST_AFTER = 0.5
+"""After this many seconds without the tracked face, the nearest face is followed instead."""
+
+Detect = Callable[[np.ndarray, float], list[FaceDetection]]
+
+
+@dataclass(frozen=True)
+class ExtractSettings:
+    """Settings that shape a track besides the video; recorded in it.
+
+    Attributes:
+        detector: Settings of the detector.
+        fps: Frames per second of the tracks; None keeps the decoded frames as they are.
+        max_gap: Longest time in seconds between two decoded frames that is interpolated across.
+        zoom: Detect small faces through a still window three faces wide (with image only).
+    """
+
+    detector: DetectorSettings = field(default_factory=DetectorSettings)
+    fps: float | None = DEFAULT_FPS
+    max_gap: float = MAX_GAP
+    zoom: bool = True
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and not (0.0 < self.fps <= 1000.0):
+            raise RequestError(f"--fps {self.fps}: between 0 and 1000, or None")
+        if not 0.0 <= self.max_gap <= 1.0:
+            raise RequestError(f"--max_gap {self.max_gap}: between 0 and 1 s")
+        if self.zoom and self.detector.running_mode == "video":
+            raise RequestError("--zoom works with --running_mode image only; add --no_zoom")
+
+    def record(self, detector: dict[str, Any]) -> dict[str, Any]:
+        """The ``detector`` of a track: the detector's description and these settings."""
+        own = {"fps": self.fps, "max_gap": self.max_gap, "zoom": self.zoom}
+        return {**detector, "settings": own}
 
 
 @dataclass(frozen=True)
@@ -45,11 +102,14 @@ class Samples:
 
 
 def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Samples, np.ndarray]:
-    """Samples every 1/fps seconds from the first source time to the last, and which were made.
+    """Detections every 1/fps seconds from the first source time to the last.
 
     A frame that falls between two decoded frames is interpolated (landmarks and position linearly,
     rotation along the arc) when both are valid and no more than ``max_gap`` seconds apart;
-    otherwise it is invalid and NaN. Returns the samples and ``interpolated`` (T,) bool.
+    otherwise it is invalid and NaN.
+
+    Returns:
+        The samples, and ``interpolated`` (T,) bool: which of them lie between two decoded frames.
     """
     times = source.timestamps
     count = int(np.floor((times[-1] - times[0]) * fps + 1e-6)) + 1
@@ -69,87 +129,20 @@ def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Sam
         source.valid[before] & source.valid[after] & (gap <= max_gap + 1e-6),
         source.valid[nearest],
     )
-    landmarks = _mix(source.landmarks, before, after, weight)
-    head_pose = _mix_poses(source.head_pose, before, after, weight)
+
+    def mix(array: np.ndarray) -> np.ndarray:
+        filled = np.nan_to_num(array)  # NaN * 0 would spoil a frame that does not need this one
+        w = weight.reshape(-1, *([1] * (array.ndim - 1)))
+        return (1 - w) * filled[before] + w * filled[after]
+
+    landmarks, head_pose = mix(source.landmarks), mix(source.head_pose)
+    known = np.isfinite(source.head_pose[:, :1, :1])
+    rotation = quaternion_from_matrix(np.where(known, source.head_pose[:, :3, :3], np.eye(3)))
+    head_pose[:, :3, :3] = matrix_from_quaternion(slerp(rotation[before], rotation[after], weight))
+    head_pose[:, 3] = (0.0, 0.0, 0.0, 1.0)
     landmarks[~valid] = np.nan
     head_pose[~valid] = np.nan
     return Samples(wanted, landmarks, head_pose, valid), between & valid
-
-
-def _mix(
-    array: np.ndarray, before: np.ndarray, after: np.ndarray, weight: np.ndarray
-) -> np.ndarray:
-    filled = np.nan_to_num(array)  # NaN * 0 would spoil a frame that its neighbour does not enter
-    w = weight.reshape(-1, *([1] * (array.ndim - 1)))
-    return (1 - w) * filled[before] + w * filled[after]
-
-
-def _mix_poses(
-    poses: np.ndarray, before: np.ndarray, after: np.ndarray, weight: np.ndarray
-) -> np.ndarray:
-    mixed = _mix(poses, before, after, weight)
-    known = np.where(np.isfinite(poses[:, :1, :1]), poses[:, :3, :3], np.eye(3))
-    quaternion = quaternion_from_matrix(known)
-    mixed[:, :3, :3] = matrix_from_quaternion(slerp(quaternion[before], quaternion[after], weight))
-    mixed[:, 3] = (0.0, 0.0, 0.0, 1.0)
-    return mixed
-
-
-#: Faces narrower than this share of the frame's longer side are looked at through a window.
-SMALL_FACE = 0.2
-#: Side of the window in face widths.
-WINDOW_FACES = 3.0
-#: The window moves when the face's middle is further than this share of its side from its own.
-OFF_CENTRE = 0.2
-#: ... and changes its size when the face's width has changed by this factor.
-SIZE_CHANGE = 1.4
-#: Seconds without a face before a search, and between searches.
-SEARCH_INTERVAL = 0.5
-
-Detect = Callable[[np.ndarray, float], list[FaceDetection]]
-
-
-@dataclass(frozen=True)
-class Window:
-    """A square of the frame: left and top edge and side, in pixels."""
-
-    left: int
-    top: int
-    side: int
-
-    def cut(self, image: np.ndarray) -> np.ndarray:
-        """The part (side, side, 3) of ``image`` under the window."""
-        rows = slice(self.top, self.top + self.side)
-        return np.ascontiguousarray(image[rows, self.left : self.left + self.side])
-
-    def fits(self, centre: np.ndarray, width: float) -> bool:
-        """Whether a face of this middle (2,) and width, in pixels, is still well inside."""
-        middle = np.array([self.left, self.top]) + self.side / 2
-        wanted = self.side / WINDOW_FACES
-        return bool(
-            np.all(np.abs(centre - middle) <= OFF_CENTRE * self.side)
-            and wanted / SIZE_CHANGE <= width <= wanted * SIZE_CHANGE
-        )
-
-
-def window_around(centre: np.ndarray, width: float, image_size: tuple[int, int]) -> Window | None:
-    """The window for a face of this middle (2,) and width in pixels; None for a large face."""
-    longer, shorter = max(image_size), min(image_size)
-    side = round(WINDOW_FACES * width)
-    if width >= SMALL_FACE * longer or side >= shorter:
-        return None
-    left, top = (
-        int(np.clip(round(c - side / 2), 0, length - side))
-        for c, length in zip(centre, image_size, strict=True)
-    )
-    return Window(left, top, side)
-
-
-def face_box(face: FaceDetection, image_size: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """Middle (2,) and width of the box around a face, in pixels."""
-    points = face.landmarks[:, :2] * image_size
-    low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2, float(high[0] - low[0])
 
 
 class ZoomingDetector:
@@ -157,15 +150,18 @@ class ZoomingDetector:
 
     A window that shows no face is kept for half a second, in case a hand has passed before it;
     then, and at the start, the frame is searched through overlapping windows, twice a second.
+
+    Attributes:
+        frames: frames seen through a window.
+        windows: times that a window was set.
     """
 
     def __init__(self, detect: Detect, canonical: CanonicalFace) -> None:
         self._detect = detect
         self._canonical = canonical
-        self._window: Window | None = None
+        self._window: Crop | None = None
         self._seen = -np.inf
         self._searched = -np.inf
-        #: frames seen through a window, and how often a window was set
         self.frames = 0
         self.windows = 0
 
@@ -181,7 +177,9 @@ class ZoomingDetector:
             self._window = None
             if time - self._searched >= SEARCH_INTERVAL:
                 self._searched = time
-                faces = self._search(image, time)
+                size = (image.shape[1], image.shape[0])
+                found = (self._through(window, image, time) for window in search_windows(size))
+                faces = next(filter(None, found), [])
         if faces:
             self._seen = time
         return faces
@@ -189,15 +187,15 @@ class ZoomingDetector:
     def refine(self, face: FaceDetection, image: np.ndarray, time: float) -> FaceDetection:
         """The followed ``face``, seen through a window if it is small and has left its old one."""
         size = (image.shape[1], image.shape[0])
-        centre, width = face_box(face, size)
-        if self._window is not None and self._window.fits(centre, width):
+        centre, width = face.box(size)
+        if self._window is not None and is_well_inside(self._window, centre, width):
             return face
         window = window_around(centre, width, size)
         if window is None or window == self._window:
             self._window = window
             return face
         distances = [
-            (float(np.linalg.norm(face_box(closer, size)[0] - centre)), index, closer)
+            (float(np.linalg.norm(closer.box(size)[0] - centre)), index, closer)
             for index, closer in enumerate(self._through(window, image, time))
         ]
         if not distances or min(distances)[0] > width / 2:
@@ -207,22 +205,38 @@ class ZoomingDetector:
         self.windows += 1
         return min(distances)[2]
 
-    def _through(self, window: Window, image: np.ndarray, time: float) -> list[FaceDetection]:
+    def _through(self, window: Crop, image: np.ndarray, time: float) -> list[FaceDetection]:
         size = (image.shape[1], image.shape[0])
         return [
             whole_image_detection(face, window, size, self._canonical)
-            for face in self._detect(window.cut(image), time)
+            for face in self._detect(np.ascontiguousarray(window.region(image)), time)
         ]
 
-    def _search(self, image: np.ndarray, time: float) -> list[FaceDetection]:
-        for window in search_windows((image.shape[1], image.shape[0])):
-            faces = self._through(window, image, time)
-            if faces:
-                return faces
-        return []
+
+def is_well_inside(window: Crop, centre: np.ndarray, width: float) -> bool:
+    """Return whether a face of this middle (2,) and width, in pixels, suits the window still."""
+    middle = np.array([window.left, window.top]) + window.side / 2
+    wanted = window.side / WINDOW_FACES
+    return bool(
+        np.all(np.abs(centre - middle) <= OFF_CENTRE * window.side)
+        and wanted / SIZE_CHANGE <= width <= wanted * SIZE_CHANGE
+    )
 
 
-def search_windows(image_size: tuple[int, int]) -> list[Window]:
+def window_around(centre: np.ndarray, width: float, image_size: tuple[int, int]) -> Crop | None:
+    """The window for a face of this middle (2,) and width in pixels; None for a large face."""
+    longer, shorter = max(image_size), min(image_size)
+    side = round(WINDOW_FACES * width)
+    if width >= SMALL_FACE * longer or side >= shorter:
+        return None
+    left, top = (
+        int(np.clip(round(c - side / 2), 0, length - side))
+        for c, length in zip(centre, image_size, strict=True)
+    )
+    return Crop(left, top, side)
+
+
+def search_windows(image_size: tuple[int, int]) -> list[Crop]:
     """Squares of half the shorter side that overlap by half, over the whole image."""
     side = min(image_size) // 2
     if side < 2:
@@ -231,64 +245,17 @@ def search_windows(image_size: tuple[int, int]) -> list[Window]:
         np.linspace(0, length - side, int(np.ceil(2 * (length - side) / side)) + 1).astype(int)
         for length in image_size
     )
-    return [Window(int(left), int(top), side) for top in tops for left in lefts]
+    return [Crop(int(left), int(top), side) for top in tops for left in lefts]
 
 
 def whole_image_detection(
-    face: FaceDetection, window: Window, image_size: tuple[int, int], canonical: CanonicalFace
+    face: FaceDetection, window: Crop, image_size: tuple[int, int], canonical: CanonicalFace
 ) -> FaceDetection:
     """A face found in ``window``, in the coordinates and under the camera of the whole image."""
     width, height = image_size
     scale = np.array([window.side / width, window.side / height, window.side / width])
     landmarks = face.landmarks * scale + (window.left / width, window.top / height, 0.0)
     return FaceDetection(landmarks, head_pose_from_landmarks(landmarks, image_size, canonical))
-
-
-logger = logging.getLogger(__name__)
-
-#: Rate of the paper's recordings (IV.B).
-DEFAULT_FPS = 30.0
-#: A face whose middle is further than this from where the tracked one was, in face widths, is
-#: another person. A mouth at 0.6 m/s crosses a seventh of a face between frames at 30 fps.
-SAME_FACE_DISTANCE = 0.75
-#: After this many seconds without the tracked face, the nearest face is followed instead.
-LOST_AFTER = 0.5
-
-
-@dataclass(frozen=True)
-class ExtractSettings:
-    """Everything that shapes a track besides the video; recorded in it."""
-
-    detector: DetectorSettings = field(default_factory=DetectorSettings)
-    #: Frames per second of the track; None keeps the decoded frames as they are.
-    fps: float | None = DEFAULT_FPS
-    #: Longest time in seconds between two decoded frames that is interpolated across.
-    max_gap: float = MAX_GAP
-    #: Look at small faces through a window (image mode only).
-    zoom: bool = True
-
-    def __post_init__(self) -> None:
-        if self.fps is not None and not (0.0 < self.fps <= 1000.0):
-            raise RequestError(f"--fps {self.fps}: between 0 and 1000, or None")
-        if not 0.0 <= self.max_gap <= 1.0:
-            raise RequestError(f"--max_gap {self.max_gap}: between 0 and 1 s")
-        if self.zoom and self.detector.running_mode == "video":
-            raise RequestError("--zoom works with --running_mode image only; add --no_zoom")
-
-
-class ProgressFactory(Protocol):
-    """Wraps the frames of a video, to show how far it has got."""
-
-    def __call__(
-        self, frames: Iterable[VideoFrame], total: int | None, name: str
-    ) -> Iterable[VideoFrame]:
-        """Pass on every one of ``frames``, of which ``total`` are expected."""
-        ...
-
-
-def no_progress(frames: Iterable[VideoFrame], total: int | None, name: str) -> Iterable[VideoFrame]:
-    """Shows nothing."""
-    return frames
 
 
 class FaceFollower:
@@ -310,7 +277,7 @@ class FaceFollower:
         """
         if not faces:
             return None
-        boxes = [face_box(face, image_size) for face in faces]
+        boxes = [face.box(image_size) for face in faces]
         if self._centre is None:
             index = int(np.argmax([width for _, width in boxes]))
         else:
@@ -326,55 +293,56 @@ class FaceFollower:
 
 
 def extract_track(
-    path: Path,
-    detector: FaceDetector,
-    settings: ExtractSettings,
-    progress: ProgressFactory = no_progress,
+    path: Path, detector: FaceDetector, settings: ExtractSettings, label: str | None = None
 ) -> FaceTrack:
     """Read the video at ``path`` and follow one face through it.
+
+    Args:
+        path: the video.
+        detector: with the settings' detector settings.
+        settings: of the track.
+        label: of a progress bar; None: no bar.
 
     Raises:
         RequestError: the video cannot be read to its end.
         NoFaceError: no frame of it shows a face.
     """
-    source_hash = sha256_of(path)
+    digest = file_digest(path)
+    follower = FaceFollower()
+    zooming = None
+    if settings.zoom:
+        zooming = ZoomingDetector(detector.detect, read_canonical_face(detector.model))
+    detect = zooming.detect if zooming else detector.detect
+    times: list[float] = []
+    found: list[FaceDetection | None] = []
+    several = 0
+    size = (0, 0)
     with VideoReader(path) as video:
-        info = video.info
-        follower = FaceFollower()
-        times: list[float] = []
-        found: list[FaceDetection | None] = []
-        zooming = None
-        if settings.zoom:
-            zooming = ZoomingDetector(detector.detect, read_canonical_face(detector.model))
-        several = 0
-        size = (0, 0)
-        for frame in progress(video.frames(), info.expected_frames or None, path.name):
+        for frame in with_bar(video.frames(), video.info.expected_frames or None, label):
             height, width = frame.image.shape[:2]
             if times and (width, height) != size:
                 raise RequestError(f"{path}: its image size changes at {frame.time:.2f} s")
             size = (width, height)
-            faces = (
-                zooming.detect(frame.image, frame.time)
-                if zooming
-                else (detector.detect(frame.image, frame.time))
-            )
+            faces = detect(frame.image, frame.time)
             several += len(faces) > 1
             times.append(frame.time)
             face = follower.choose(faces, frame.time, size)
             if zooming and face is not None:
                 face = zooming.refine(face, frame.image, frame.time)
             found.append(face)
+    steps = np.diff(times)
     source = {
         "name": path.name,
-        "sha256": source_hash,
+        "sha256": digest,
         "frames": len(times),
         "frames_with_face": sum(face is not None for face in found),
         "frames_with_several_faces": several,
         "reacquired": follower.reacquired,
         "frames_zoomed": zooming.frames if zooming else 0,
         "zoom_windows": zooming.windows if zooming else 0,
-        "average_rate": info.average_rate,
-        "variable_rate": is_variable_rate(times),
+        "average_rate": video.info.average_rate,
+        # intervals that differ by more than 5 ms; container clocks tick more finely
+        "variable_rate": bool(len(steps) > 1 and np.ptp(steps) > 0.005),
     }
     if source["frames_with_face"] == 0:
         raise NoFaceError(f"{path}: no face found in any of its {len(times)} frames")
@@ -390,13 +358,12 @@ def build_track(
     detector: dict[str, Any],
 ) -> FaceTrack:
     """Put detections (one per decoded frame, None: no face) at a constant rate."""
+    nowhere = FaceDetection(np.full((NUM_LANDMARKS, 3), np.nan), np.full((4, 4), np.nan))
     samples = Samples(
         timestamps=np.array(times),
-        landmarks=np.array(
-            [np.full((NUM_LANDMARKS, 3), np.nan) if f is None else f.landmarks for f in found]
-        ),
-        head_pose=np.array([np.full((4, 4), np.nan) if f is None else f.head_pose for f in found]),
-        valid=np.array([f is not None for f in found]),
+        landmarks=np.array([(face or nowhere).landmarks for face in found]),
+        head_pose=np.array([(face or nowhere).head_pose for face in found]),
+        valid=np.array([face is not None for face in found]),
     )
     fps = settings.fps
     if fps is None:
@@ -405,7 +372,6 @@ def build_track(
         fps = (len(times) - 1) / span if span > 0 else 1.0
     else:
         track, interpolated = resample(samples, fps, settings.max_gap)
-    settings_record = {key: value for key, value in asdict(settings).items() if key != "detector"}
     return FaceTrack(
         landmarks=track.landmarks.astype(np.float32),
         valid=track.valid,
@@ -418,20 +384,14 @@ def build_track(
         source_timestamps=samples.timestamps,
         source_valid=samples.valid,
         source=source,
-        detector={**detector, "settings": settings_record},
+        detector=settings.record(detector),
     )
 
 
-def is_variable_rate(times: Sequence[float]) -> bool:
-    """Whether the intervals between decoded frames differ by more than 5 ms (container ticks)."""
-    steps = np.diff(times)
-    return bool(len(steps) > 1 and np.ptp(steps) > 0.005)
-
-
-def is_up_to_date(
+def is_track_up_to_date(
     out: Path, source_hash: str, settings: ExtractSettings, detector: dict[str, Any]
 ) -> bool:
-    """Whether ``out`` already holds the track of this video made with these settings.
+    """Return whether ``out`` already holds the track of this video made with these settings.
 
     Raises:
         RequestError: ``out`` exists and is no face track, so that writing would destroy it.
@@ -442,8 +402,6 @@ def is_up_to_date(
         track = load_track(out)
     except RequestError as error:
         raise RequestError(f"{error}; it is in the way of a track, so remove it first") from None
-    wanted = {
-        **detector,
-        "settings": {k: v for k, v in asdict(settings).items() if k != "detector"},
-    }
-    return track.source.get("sha256") == source_hash and dict(track.detector) == wanted
+    return track.source.get("sha256") == source_hash and dict(track.detector) == settings.record(
+        detector
+    )

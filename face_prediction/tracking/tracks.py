@@ -14,12 +14,26 @@ from typing import Any
 import numpy as np
 
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.npz import read_npz, require_array, write_npz
+from robo_manip_baselines.runs.npz import read_npz, require_array, require_json, write_npz
 
 SCHEMA = "face_track"
 VERSION = 1
-#: MediaPipe's face mesh; the ten iris points that the detector adds are not kept.
 NUM_LANDMARKS = 468
+"""MediaPipe's face mesh; the ten iris points that the detector adds are not kept."""
+
+_ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
+    "landmarks": ("float32", ("T", NUM_LANDMARKS, 3)),
+    "valid": ("bool", ("T",)),
+    "interpolated": ("bool", ("T",)),
+    "timestamps": ("float64", ("T",)),
+    "head_pose": ("float64", ("T", 4, 4)),
+    "jaw": ("float32", ("T",)),
+    "image_size": ("int64", (2,)),
+    "fps": ("float64", ()),
+    "source_timestamps": ("float64", ("S",)),
+    "source_valid": ("bool", ("S",)),
+}
+"""Type and shape of every array, in the order of the file."""
 
 
 class NoFaceError(RequestError):
@@ -30,116 +44,94 @@ class NoFaceError(RequestError):
 class FaceTrack:
     """One face of one video at a constant rate.
 
-    Frames without a face, and frames that could only be guessed across a gap, have ``valid``
-    False and NaN in the others.
+    Frames without a face, and frames inside a gap too long to interpolate across, have ``valid``
+    False and NaN in the other arrays.
+
+    Attributes:
+        landmarks: (T, 468, 3) float32: x right / image width, y down / image height, and
+            MediaPipe's relative depth z (smaller is nearer) / image width.
+        valid: (T,) bool.
+        interpolated: (T,) bool: the frame lies between two decoded frames and was interpolated.
+        timestamps: (T,) float64, seconds on the video's clock.
+        head_pose: (T, 4, 4) float64, metres: camera from head. Camera frame: x right in the image,
+            y up, z toward the camera. Head frame: MediaPipe's canonical face (x subject's left,
+            y up, z out).
+        jaw: (T,) float32, metres between the inner lips (landmarks 13 and 14); NaN also where the
+            mouth is seen from the side.
+        image_size: (width, height) in pixels, as displayed.
+        fps: frames per second of the arrays above.
+        source_timestamps: (S,) float64 s of every decoded frame.
+        source_valid: (S,) bool: the face was found in the decoded frame.
+        source: name, sha256, frame counts and rates of the video.
+        detector: name, version, model hash, running mode and settings of the detector.
     """
 
-    #: (T, 468, 3) float32: x right / image width, y down / image height, and MediaPipe's relative
-    #: depth z (smaller is nearer) / image width.
     landmarks: np.ndarray
-    #: (T,) bool
     valid: np.ndarray
-    #: (T,) bool: the frame lies between two decoded frames and was interpolated from them.
     interpolated: np.ndarray
-    #: (T,) float64, seconds on the video's clock
     timestamps: np.ndarray
-    #: (T, 4, 4) float64, metres: camera from head. Camera frame: x right in the image, y up,
-    #: z toward the camera. Head frame: MediaPipe's canonical face (x subject's left, y up, z out).
     head_pose: np.ndarray
-    #: (T,) float32, metres between the inner lips (landmarks 13 and 14); NaN also where the mouth
-    #: is seen from the side
     jaw: np.ndarray
-    #: (width, height) in pixels, as displayed
     image_size: tuple[int, int]
-    #: frames per second of the arrays above
     fps: float
-    #: (S,) float64 s and (S,) bool: every decoded frame, and whether the face was found in it
     source_timestamps: np.ndarray
     source_valid: np.ndarray
-    #: name, sha256, frame counts and rates of the video
     source: Mapping[str, Any] = field(default_factory=dict)
-    #: name, version, model hash, running mode and settings of the detector
     detector: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.valid)
 
+    @property
+    def has_constant_rate(self) -> bool:
+        """Frames are 1 / fps apart, to a millisecond (container clocks tick that coarsely)."""
+        return bool(np.all(np.abs(np.diff(self.timestamps) - 1 / self.fps) < 1e-3))
+
 
 def save_track(path: Path, track: FaceTrack) -> None:
     """Write ``track`` to ``path``, whole or not at all."""
-    write_npz(
-        path,
-        {
-            "schema": np.array(SCHEMA),
-            "version": np.array(VERSION),
-            "landmarks": track.landmarks.astype(np.float32),
-            "valid": track.valid.astype(bool),
-            "interpolated": track.interpolated.astype(bool),
-            "timestamps": track.timestamps.astype(np.float64),
-            "head_pose": track.head_pose.astype(np.float64),
-            "jaw": track.jaw.astype(np.float32),
-            "image_size": np.array(track.image_size, dtype=np.int64),
-            "fps": np.array(track.fps, dtype=np.float64),
-            "source_timestamps": track.source_timestamps.astype(np.float64),
-            "source_valid": track.source_valid.astype(bool),
-            "source": np.array(json.dumps(dict(track.source), sort_keys=True)),
-            "detector": np.array(json.dumps(dict(track.detector), sort_keys=True)),
-        },
-    )
+    arrays = {name: np.asarray(getattr(track, name), kind) for name, (kind, _) in _ARRAYS.items()}
+    for name in ("source", "detector"):
+        arrays[name] = np.array(json.dumps(dict(getattr(track, name)), sort_keys=True))
+    write_npz(path, {"schema": np.array(SCHEMA), "version": np.array(VERSION), **arrays})
 
 
 def load_track(path: Path) -> FaceTrack:
     """Read and check the face track at ``path``.
 
     Raises:
-        RequestError: the file is absent, damaged, of another schema, or breaks a promise of
-            :class:`FaceTrack`; the message names the file and the key.
+        RequestError: the file is absent, damaged, of another schema, or its arrays do not agree;
+            the message names the file and the key.
     """
     arrays = read_npz(path, SCHEMA, VERSION)
-    valid = require_array(path, arrays, "valid", (None,), "b")
-    frames = len(valid)
-    source_valid = require_array(path, arrays, "source_valid", (None,), "b")
-    size = require_array(path, arrays, "image_size", (2,), "iu")
+    lengths = {
+        name: len(require_array(path, arrays, key, (None,), "b"))
+        for name, key in (("T", "valid"), ("S", "source_valid"))
+    }
+    values: dict[str, Any] = {
+        name: require_array(
+            path,
+            arrays,
+            name,
+            tuple(lengths[n] if isinstance(n, str) else n for n in shape),
+            np.dtype(dtype).kind.replace("i", "iu"),
+        )
+        for name, (dtype, shape) in _ARRAYS.items()
+    }
+    values["image_size"] = tuple(values["image_size"].tolist())
+    values["fps"] = float(values["fps"])
     track = FaceTrack(
-        landmarks=require_array(path, arrays, "landmarks", (frames, NUM_LANDMARKS, 3), "f"),
-        valid=valid,
-        interpolated=require_array(path, arrays, "interpolated", (frames,), "b"),
-        timestamps=require_array(path, arrays, "timestamps", (frames,), "f"),
-        head_pose=require_array(path, arrays, "head_pose", (frames, 4, 4), "f"),
-        jaw=require_array(path, arrays, "jaw", (frames,), "f"),
-        image_size=(int(size[0]), int(size[1])),
-        fps=float(require_array(path, arrays, "fps", (), "f")),
-        source_timestamps=require_array(
-            path, arrays, "source_timestamps", (len(source_valid),), "f"
-        ),
-        source_valid=source_valid,
-        source=_mapping(path, arrays, "source"),
-        detector=_mapping(path, arrays, "detector"),
+        **values,
+        source=require_json(path, arrays, "source"),
+        detector=require_json(path, arrays, "detector"),
     )
-    _check_values(path, track)
-    return track
-
-
-def _mapping(path: Path, arrays: dict[str, np.ndarray], key: str) -> dict[str, Any]:
-    text = str(require_array(path, arrays, key, (), "U"))
-    try:
-        value = json.loads(text)
-    except json.JSONDecodeError:
-        value = None
-    if not isinstance(value, dict):
-        raise RequestError(f"{path}: '{key}' is not a JSON object; make the file again")
-    return value
-
-
-def _check_values(path: Path, track: FaceTrack) -> None:
     if min(track.image_size) <= 0 or not (np.isfinite(track.fps) and track.fps > 0):
         raise RequestError(
             f"{path}: image_size {track.image_size} and fps {track.fps} must be positive"
         )
-    steps = np.diff(track.timestamps)
-    if not np.all(np.isfinite(track.timestamps)) or np.any(steps <= 0):
+    if not np.all(np.isfinite(track.timestamps)) or np.any(np.diff(track.timestamps) <= 0):
         raise RequestError(f"{path}: 'timestamps' must be finite and increasing")
     for key in ("landmarks", "head_pose"):
-        array = getattr(track, key)
-        if not np.all(np.isfinite(array[track.valid])):
+        if not np.all(np.isfinite(getattr(track, key)[track.valid])):
             raise RequestError(f"{path}: '{key}' holds NaN or infinity in a frame marked valid")
+    return track

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,10 @@ from tqdm import tqdm
 
 from robo_manip_baselines.runs.errors import RequestError
 
-#: A video that decodes to less than this share of what its header promises is refused as
-#: truncated, where no damaged packet has told so already (Matroska). Edit lists drop some frames
-#: of whole files: the worst of 68 test clips gives 93 % (1531 of 1641).
 WHOLE_SHARE = 0.9
+"""A video that decodes to less than this share of the frames in its header is refused as truncated,
+where no damaged packet has revealed it already (Matroska). Edit lists drop some frames of whole
+files: the worst of 68 test clips gives 93 % (1531 of 1641)."""
 
 
 @dataclass(frozen=True)
@@ -28,26 +27,17 @@ class VideoFrame:
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What the header of a video says. ``expected_frames`` is 0 where it says nothing."""
+    """Header of a video. ``expected_frames`` is 0 where the header does not give it."""
 
     expected_frames: int
     average_rate: float
-
-
-def sha256_of(path: Path) -> str:
-    """Hex SHA-256 of the bytes of the file at ``path``."""
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def require_video(path: Path) -> None:
     """Check that ``path`` is a file that can be read.
 
     Raises:
-        RequestError: it is absent, a folder, or unreadable.
+        RequestError: it is absent, a folder, empty or unreadable.
     """
     if path.is_dir():
         raise RequestError(f"{path}: is a folder; name video files")
@@ -85,10 +75,16 @@ class VideoReader:
         if not self._container.streams.video:
             self._container.close()
             raise RequestError(f"{path}: holds no video stream")
-        self._stream = self._container.streams.video[0]
-        self._stream.thread_type = "AUTO"
-        rate = self._stream.average_rate or self._stream.guessed_rate
-        self.info = VideoInfo(self._expected_frames(), float(rate) if rate else 0.0)
+        stream = self._stream = self._container.streams.video[0]
+        stream.thread_type = "AUTO"
+        expected = 0
+        if stream.frames:
+            expected = int(stream.frames)
+        elif stream.average_rate and stream.duration and stream.time_base:
+            expected = int(stream.duration * stream.time_base * stream.average_rate)
+        elif stream.average_rate and self._container.duration and len(self._container.streams) == 1:
+            expected = int(self._container.duration / 1e6 * float(stream.average_rate))
+        self.info = VideoInfo(expected, float(stream.average_rate or stream.guessed_rate or 0.0))
 
     def __enter__(self) -> VideoReader:
         return self
@@ -115,7 +111,7 @@ class VideoReader:
                 for frame in packet.decode():
                     count += 1
                     if frame.time is None or frame.time <= last:
-                        continue  # two frames at one instant: the first stands for both
+                        continue  # of two frames at one instant the first is kept
                     last = frame.time
                     image = frame.to_ndarray(format="rgb24")
                     yield VideoFrame(last, upright(image, frame.rotation))
@@ -133,49 +129,23 @@ class VideoReader:
         if count == 0:
             raise RequestError(f"{self._path}: holds no frame that can be decoded")
 
-    def _expected_frames(self) -> int:
-        if self._stream.frames:
-            return int(self._stream.frames)
-        rate = self._stream.average_rate
-        if rate and self._stream.duration and self._stream.time_base:
-            return int(self._stream.duration * self._stream.time_base * rate)
-        if rate and self._container.duration and len(self._container.streams) == 1:
-            return int(self._container.duration / 1e6 * float(rate))
-        return 0
-
 
 def upright(image: np.ndarray, rotation: int) -> np.ndarray:
     """``image`` (H, W, 3) turned as its display matrix asks, as a C-contiguous array.
 
-    ``rotation`` is PyAV's: degrees counter-clockwise that the picture must be turned by.
-
-    Contiguous matters: PyAV pads the rows of images whose width is no multiple of 32, and
-    MediaPipe reads such an array as if it had no padding, a sheared picture without a face.
+    ``rotation`` is PyAV's: degrees counter-clockwise to turn the image by. Contiguous because PyAV
+    pads the rows of images whose width is no multiple of 32, and MediaPipe reads such an array as
+    if it had no padding: a sheared image without a face.
     """
     return np.ascontiguousarray(np.rot90(image, k=round(rotation / 90) % 4))
 
 
-@dataclass(frozen=True)
-class FrameBar:
-    """Shows how far a video has been read, while its frames are passed on.
+def with_bar(
+    frames: Iterable[VideoFrame], total: int | None, label: str | None
+) -> Iterable[VideoFrame]:
+    """Pass on ``frames`` under a progress bar called ``label``; None: without a bar.
 
-    Attributes:
-        prefix: stands before the name of the video.
-        shown: whether there is a bar at all.
+    ``total`` is the number of frames, None where it is not known.
     """
-
-    prefix: str
-    shown: bool
-
-    def __call__(
-        self, frames: Iterable[VideoFrame], total: int | None, name: str
-    ) -> Iterable[VideoFrame]:
-        """Pass on the frames of the video called ``name``; ``total`` is None where not known."""
-        return tqdm(
-            frames,
-            total=total,
-            desc=self.prefix + name,
-            unit="frame",
-            leave=False,
-            disable=not self.shown,
-        )
+    shown = label is not None
+    return tqdm(frames, total=total, desc=label, unit="frame", leave=False, disable=not shown)

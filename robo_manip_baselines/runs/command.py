@@ -43,13 +43,14 @@ _PLAINER = (
         r"Missing value for argument '?\(?'([^\s',]+)',?\)?'?\. Expected \d+ values?",
         r"\1 needs a value",
     ),
-    (r"Missing from \S+?: ", "missing: "),
+    (r"Missing from [^:]+: ", "missing: "),
     (r" \(required\)", ""),
     (
         r"invalid choice '(.*)' for argument '(.*)'. Expected one of \((.*)\)",
         r"\2 is one of \3, not '\1'",
     ),
 )
+_SECTIONS = re.compile(r"\n\n(?:Attributes|Raises):\n")  # of a docstring, no part of a description
 _OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 
@@ -99,61 +100,68 @@ def run_command(
 @overload
 def parse(
     options_type: type[Options],
-    example: str,
+    example: str | None,
     *,
     description: str | None = None,
     args: Sequence[str] | None = None,
     default: Options | None = None,
+    prog: str | None = None,
 ) -> Options: ...
 
 
 @overload
 def parse(
     options_type: Any,
-    example: str,
+    example: str | None,
     *,
     description: str | None = None,
     args: Sequence[str] | None = None,
     default: Any = None,
+    prog: str | None = None,
 ) -> Any: ...
 
 
 def parse(
     options_type: Any,
-    example: str,
+    example: str | None,
     *,
     description: str | None = None,
     args: Sequence[str] | None = None,
     default: Any = None,
+    prog: str | None = None,
 ) -> Any:
     """Read the command line into ``options_type``.
 
-    ``--help`` prints every option with its default, and the example. Options have
+    ``--help`` prints every option with its default, and the example. Options are spelt with
     underscores; hyphens work too.
 
     Args:
         options_type: a dataclass, or a union of dataclasses for subcommands. A `RequestError`
             from its ``__post_init__`` passes through unchanged.
-        example: a command line that works, shown at the end of the description.
+        example: a command line that works, shown at the end of the description; None: the docstring
+            of ``options_type`` has one.
         description: first words of the help; by default the docstring of ``options_type``.
         args: instead of ``sys.argv[1:]``.
         default: an instance whose values are the defaults, instead of those of ``options_type``.
+        prog: name of the program, with the subcommand if any; by default ``sys.argv[0]``.
 
     Raises:
         RequestError: one line that names what was wrong and what is valid.
         SystemExit: with code 0 after ``--help``.
     """
     given = list(sys.argv[1:] if args is None else args)
-    text = description or inspect.getdoc(options_type) or ""
-    text = f"{text.strip()}\n\nExample: {example}"
-    result, unknown = _call_tyro(options_type, text, given, default)
+    text = _SECTIONS.split(description or inspect.getdoc(options_type) or "")[0].strip()
+    if example is not None:
+        text += f"\n\nExample: {example}"
+    program = sys.argv[0] if prog is None else prog
+    result, unknown = _call_tyro(options_type, text, given, default, program)
     if unknown:
-        raise RequestError(_unknown_message(unknown, options_type, text, given, default))
+        raise RequestError(_unknown_message(unknown, options_type, text, given, default, program))
     return result
 
 
 def _call_tyro(
-    options_type: Any, description: str, args: Sequence[str], default: Any
+    options_type: Any, description: str, args: Sequence[str], default: Any, prog: str
 ) -> tuple[Any, list[str]]:
     errors = io.StringIO()
     try:
@@ -162,6 +170,7 @@ def _call_tyro(
                 "tuple[Any, list[str]]",
                 tyro.cli(
                     options_type,
+                    prog=prog,
                     description=description,
                     args=args,
                     **({} if default is None else {"default": default}),
@@ -182,7 +191,7 @@ def _call_tyro(
         message = _box_to_line(errors.getvalue())
         if message.startswith("Expected one of") and args:  # a subcommand
             message = f"'{args[0]}' is no subcommand: {message[0].lower()}{message[1:]}"
-        raise RequestError(f"{message}; {_help_hint()}") from None
+        raise RequestError(f"{message}; {_help_hint(prog)}") from None
 
 
 def _unknown_message(
@@ -191,32 +200,34 @@ def _unknown_message(
     description: str,
     args: Sequence[str],
     default: Any,
+    prog: str,
 ) -> str:
     known = _known_options(
-        options_type, description, [a for a in args if a not in unknown], default
+        options_type, description, [a for a in args if a not in unknown], default, prog
     )
     name = next((arg for arg in unknown if arg.startswith("-")), unknown[0])
     if not name.startswith("-"):
-        return f"'{name}' is one argument too many; {_help_hint()}"
+        return f"'{name}' is one argument too many; {_help_hint(prog)}"
     name = name.split("=")[0]
     close = difflib.get_close_matches(name.replace("-", "_"), [k.replace("-", "_") for k in known])
     hint = f" (did you mean '--{close[0].lstrip('_')}'?)" if close else ""
-    return f"unknown option '{name}'{hint}; valid: {', '.join(known)}; {_help_hint()}"
+    return f"unknown option '{name}'{hint}; valid: {', '.join(known)}; {_help_hint(prog)}"
 
 
 def _known_options(
-    options_type: Any, description: str, args: Sequence[str], default: Any
+    options_type: Any, description: str, args: Sequence[str], default: Any, prog: str
 ) -> list[str]:
     """The options that ``--help`` lists after ``args``, which may hold a subcommand."""
     page = io.StringIO()
     with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit, RequestError):
-        _call_tyro(options_type, description.split("\n\nExample:")[0], [*args, "--help"], default)
+        text = description.split("\n\nExample:")[0]
+        _call_tyro(options_type, text, [*args, "--help"], default, prog)
     names = _OPTION.findall(_ANSI.sub("", page.getvalue()))
     return list(dict.fromkeys(name for name in names if name != "--help"))
 
 
 def _box_to_line(text: str) -> str:
-    """Extract the message from tyro's box: no box, help text or footer."""
+    """What tyro says in its box, without the box, the help text and the footer."""
     lines = _ANSI.sub("", text).splitlines()
     body: list[str] = []
     for line in lines[1:]:
@@ -229,8 +240,8 @@ def _box_to_line(text: str) -> str:
     return message
 
 
-def _help_hint() -> str:
-    return f"'{sys.argv[0]} --help' lists what is valid"
+def _help_hint(prog: str) -> str:
+    return f"'{prog} --help' lists what is valid"
 
 
 def _one_line(message: object) -> str:
@@ -243,7 +254,7 @@ def _say(line: str, code: int) -> int:
 
 
 def _is_reader_gone() -> bool:
-    """Return whether stdout is a pipe without a reader."""
+    """Whether stdout is a pipe that nobody reads any more."""
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), select.POLLOUT)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +38,7 @@ def read_npz(path: Path, schema: str, version: int) -> Arrays:
     if not path.is_file():
         raise RequestError(f"{path}: no such file; expected a '{schema}' .npz")
     try:
-        # opened and looked at here, because NumPy leaves a damaged file open
+        # opened and checked here, because NumPy leaves a damaged file open
         with path.open("rb") as stream, zipfile.ZipFile(stream):
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as stored:
@@ -80,3 +82,18 @@ def require_array(
             f"expected kind '{kind}' and shape {wanted_shape}"
         )
     return array
+
+
+def require_json(path: Path, arrays: Arrays, key: str) -> dict[str, Any]:
+    """Return the JSON object that ``arrays[key]`` holds as text.
+
+    Raises:
+        RequestError: the key is missing, or is no JSON object.
+    """
+    try:
+        value = json.loads(str(require_array(path, arrays, key, (), "U")))
+    except json.JSONDecodeError:
+        value = None
+    if not isinstance(value, dict):
+        raise RequestError(f"{path}: '{key}' is not a JSON object; make the file again")
+    return value

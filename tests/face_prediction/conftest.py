@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -12,9 +13,10 @@ import av
 import numpy as np
 import pytest
 
-from face_prediction.tracking.geometry import rigid_face
-from face_prediction.tracking.lifting import CANONICAL_MOUTH, LIPS
+from face_prediction.commands.cli import main
+from face_prediction.tracking.geometry import CANONICAL_MOUTH, LIPS, rigid_face
 from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def _project(points: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
@@ -137,3 +139,19 @@ def statsmodels() -> Callable[[str], Any]:
             return pytest.importorskip(f"statsmodels.{name}", reason="statsmodels is not installed")
 
     return module
+
+
+@pytest.fixture(scope="session")
+def exit_code() -> Callable[[Sequence[str]], int]:
+    """Run the command line and return its exit code; an error becomes a line of the log."""
+
+    def run(arguments: Sequence[str]) -> int:
+        try:
+            return main(arguments)
+        except RequestError as error:
+            logging.getLogger(__name__).error("%s", error)
+            return 2
+        except KeyboardInterrupt:
+            return 130
+
+    return run

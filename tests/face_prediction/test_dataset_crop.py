@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.tracking.crop import Crop, crop_around
+from face_prediction.tracking.geometry import Crop, crop_around
 
 
 def box(left: float, top: float, right: float, bottom: float, size=(640, 480)) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from face_prediction.commands.cli import main
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 
 pytestmark = [pytest.mark.shared, pytest.mark.long]
 
@@ -62,12 +62,12 @@ def test_kinds_rates_and_size(dataset) -> None:
             "carphone": "head_motion", "grid10_bbaf2n": "grid", "intel_asl_book": "natural",
         }  # fmt: skip
         rows = data.rows()
-    facts = {row.clip: row.facts for row in rows}
+    found = {row.clip: row.statistics for row in rows}
     # of 25 frames a second five in six are made from two; the pictures are at most half a frame off
-    assert facts["grid10_bbaf2n"]["interpolated_share"] == pytest.approx(62 / 75, abs=0.02)
-    assert facts["grid10_bbaf2n"]["image_lag"] <= 0.0201
+    assert found["grid10_bbaf2n"]["interpolated_share"] == pytest.approx(62 / 75, abs=0.02)
+    assert found["grid10_bbaf2n"]["image_lag"] <= 0.0201
     # a reader of sentences hardly moves the head; the man in the car does
-    assert facts["grid10_bbaf2n"]["mouth_range_u"] < 0.05 < facts["carphone"]["mouth_range_u"]
+    assert found["grid10_bbaf2n"]["mouth_range_u"] < 0.05 < found["carphone"]["mouth_range_u"]
     # 1000 sequences in less than 2 GB
     size = sum(path.stat().st_size for path in dataset.rglob("*") if path.is_file())
     assert size / len(rows) < 2e6

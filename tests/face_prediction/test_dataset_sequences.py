@@ -1,4 +1,4 @@
-"""Tracks to sequences: rate, what is dropped and why, and what the facts say."""
+"""Tracks to sequences: rate, what is dropped and why, and what the found say."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.dataset.manifest import FACTS, largest_angle, sequence_facts
-from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.dataset.sequences import (
+    STATISTICS,
+    SequenceSettings,
+    clip_frames,
+    find_sequences,
+    largest_angle,
+    sequence_statistics,
+)
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
 SETTINGS = SequenceSettings(history=8, future=2, stride=5)
@@ -118,7 +123,7 @@ def test_the_crop_of_the_history_knows_nothing_of_the_future(make_track) -> None
     assert crops[0].side < wider[0].side
 
 
-def test_facts_of_a_motion_that_is_known(make_track) -> None:
+def test_found_of_a_motion_that_is_known(make_track) -> None:
     frames = 10
     mouth = still(frames)
     mouth[:, 0] = np.linspace(0.0, 0.018, frames)
@@ -132,21 +137,22 @@ def test_facts_of_a_motion_that_is_known(make_track) -> None:
     marked = np.zeros(frames, dtype=bool)
     marked[:3] = True
     clip, sequences = cut(replace(track, interpolated=marked))
-    facts = {name: column[0] for name, column in sequence_facts(clip, sequences, SETTINGS).items()}
-    assert set(facts) == {fact.name for fact in FACTS}
+    columns = sequence_statistics(clip, sequences, SETTINGS)
+    found = {name: column[0] for name, column in columns.items()}
+    assert list(found) == list(STATISTICS)
     # micrometres: landmarks are kept in single precision
-    assert facts["mouth_range_x"] == pytest.approx(0.018, abs=2e-5)
-    assert facts["mouth_range_y"] == pytest.approx(0.009, abs=2e-5)
-    assert facts["mouth_range_z"] == pytest.approx(0.0, abs=1e-4)
-    assert facts["head_rotation_range"] == pytest.approx(12.0, abs=0.01)
-    assert facts["mouth_opening_range"] == pytest.approx(0.012, abs=1e-5)
-    assert facts["interpolated_share"] == pytest.approx(0.3)
-    assert facts["image_lag"] == 0.0
-    assert facts["crop_side"] == sequences.crops[0].side
+    assert found["mouth_range_x"] == pytest.approx(0.018, abs=2e-5)
+    assert found["mouth_range_y"] == pytest.approx(0.009, abs=2e-5)
+    assert found["mouth_range_z"] == pytest.approx(0.0, abs=1e-4)
+    assert found["head_rotation_range"] == pytest.approx(12.0, abs=0.01)
+    assert found["mouth_opening_range"] == pytest.approx(0.012, abs=1e-5)
+    assert found["interpolated_share"] == pytest.approx(0.3)
+    assert found["image_lag"] == 0.0
+    assert found["crop_side"] == sequences.crops[0].side
     centre = track.landmarks[:, list(LIPS), :2].mean(axis=1) * [640, 480]
     u, v = np.ptp(centre, axis=0) / sequences.crops[0].side
-    assert facts["mouth_range_u"] == pytest.approx(u, rel=1e-5)
-    assert facts["mouth_range_v"] == pytest.approx(v, rel=1e-5)
+    assert found["mouth_range_u"] == pytest.approx(u, rel=1e-5)
+    assert found["mouth_range_v"] == pytest.approx(v, rel=1e-5)
 
 
 @pytest.mark.parametrize(("axis", "step"), [(0, 0.015), (0, -0.015), (1, 0.015), (1, -0.015)])
@@ -155,10 +161,10 @@ def test_a_face_that_leaves_the_crop_is_counted(make_track, axis, step) -> None:
     mouth[8, axis], mouth[9, axis] = step, 2 * step
     tight = replace(SETTINGS, margin=0.0)
     clip, sequences = cut(make_track(mouth), tight)
-    assert sequence_facts(clip, sequences, tight)["outside_share"].tolist() == [1.0]
+    assert sequence_statistics(clip, sequences, tight)["outside_share"].tolist() == [1.0]
     wide = replace(SETTINGS, margin=0.5)
     clip, sequences = cut(make_track(mouth), wide)
-    assert sequence_facts(clip, sequences, wide)["outside_share"].tolist() == [0.0]
+    assert sequence_statistics(clip, sequences, wide)["outside_share"].tolist() == [0.0]
 
 
 def test_largest_angle_is_between_any_two() -> None:

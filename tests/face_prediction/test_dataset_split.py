@@ -9,18 +9,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.dataset.manifest import Amount, assign_folds, fold_split
-from face_prediction.dataset.settings import kind_of
+from face_prediction.dataset.manifest import ClipEntry, assign_folds, fold_split
+from face_prediction.dataset.sequences import kind_of
 from face_prediction.motion.library import Attribution, read_attributions
 from robo_manip_baselines.runs.errors import RequestError
 
 
-def totals(amounts, folds, seed=0):
-    chosen = assign_folds(amounts, folds, seed)
+def clip(subject: str, kind: str, sequences: int) -> ClipEntry:
+    made_of = dict.fromkeys(("licence", "source", "track_sha256", "video", "video_sha256"), "")
+    return ClipEntry(
+        "", subject, kind, None, True, sequences=sequences, candidates=0, dropped={}, **made_of
+    )
+
+
+def totals(clips, folds, seed=0):
+    chosen = assign_folds(clips, folds, seed)
     result = np.zeros(folds, dtype=int)
-    for amount in amounts:
-        if amount.subject in chosen:
-            result[chosen[amount.subject]] += amount.sequences
+    for entry in clips:
+        if entry.subject in chosen:
+            result[chosen[entry.subject]] += entry.sequences
     return result
 
 
@@ -30,50 +37,50 @@ def totals(amounts, folds, seed=0):
     seed=st.integers(0, 9),
 )
 def test_everybody_is_in_one_fold_and_none_is_empty(counts, folds, seed) -> None:
-    amounts = [Amount(f"p{i}", "natural", n) for i, n in enumerate(counts)]
-    chosen = assign_folds(amounts, folds, seed)
-    assert sorted(chosen) == sorted(a.subject for a in amounts)
-    held = totals(amounts, folds, seed)
+    clips = [clip(f"p{i}", "natural", n) for i, n in enumerate(counts)]
+    chosen = assign_folds(clips, folds, seed)
+    assert sorted(chosen) == sorted(a.subject for a in clips)
+    held = totals(clips, folds, seed)
     assert held.min() > 0
     # the largest first, to the emptiest fold: no two differ by more than one person
     assert held.max() - held.min() <= max(counts)
-    assert assign_folds(amounts[::-1], folds, seed) == chosen
+    assert assign_folds(clips[::-1], folds, seed) == chosen
 
 
 def test_clips_of_one_person_stay_together() -> None:
-    amounts = [Amount(f"p{i % 6}", "natural", 10 + i) for i in range(30)]
-    chosen = assign_folds(amounts, 3, 0)
+    clips = [clip(f"p{i % 6}", "natural", 10 + i) for i in range(30)]
+    chosen = assign_folds(clips, 3, 0)
     assert len(chosen) == 6
-    assert totals(amounts, 3).tolist() == pytest.approx([sum(range(10, 40)) / 3] * 3, rel=0.1)
+    assert totals(clips, 3).tolist() == pytest.approx([sum(range(10, 40)) / 3] * 3, rel=0.1)
 
 
 def test_every_kind_is_spread() -> None:
-    amounts = [Amount(f"n{i}", "natural", 20) for i in range(10)]
-    amounts += [Amount(f"h{i}", "head_motion", 5) for i in range(10)]
-    chosen = assign_folds(amounts, 5, 3)
+    clips = [clip(f"n{i}", "natural", 20) for i in range(10)]
+    clips += [clip(f"h{i}", "head_motion", 5) for i in range(10)]
+    chosen = assign_folds(clips, 5, 3)
     for letter in "nh":
         in_fold = [fold for name, fold in chosen.items() if name[0] == letter]
         assert np.bincount(in_fold, minlength=5).tolist() == [2] * 5
 
 
 def test_people_without_sequences_are_in_no_fold() -> None:
-    amounts = [Amount("a", "natural", 3), Amount("b", "natural", 0), Amount("c", "grid", 1)]
-    assert sorted(assign_folds(amounts, 2, 0)) == ["a", "c"]
+    clips = [clip("a", "natural", 3), clip("b", "natural", 0), clip("c", "grid", 1)]
+    assert sorted(assign_folds(clips, 2, 0)) == ["a", "c"]
     with pytest.raises(RequestError, match="--folds 3: only 2 subjects have sequences"):
-        assign_folds(amounts, 3, 0)
+        assign_folds(clips, 3, 0)
 
 
 def test_the_seed_matters_only_for_ties() -> None:
-    different = [Amount(f"p{i}", "natural", 2**i) for i in range(8)]
+    different = [clip(f"p{i}", "natural", 2**i) for i in range(8)]
     assert len({tuple(assign_folds(different, 4, s).items()) for s in range(5)}) == 1
-    same = [Amount(f"p{i}", "natural", 7) for i in range(8)]
+    same = [clip(f"p{i}", "natural", 7) for i in range(8)]
     assert len({tuple(assign_folds(same, 4, s).items()) for s in range(5)}) > 1
 
 
 @pytest.mark.parametrize(("folds", "seed", "word"), [(0, 0, "--folds 0"), (2, -1, "--seed -1")])
 def test_numbers_out_of_range(folds, seed, word) -> None:
     with pytest.raises(RequestError, match=word):
-        assign_folds([Amount("a", "natural", 1)] * 3, folds, seed)
+        assign_folds([clip("a", "natural", 1)] * 3, folds, seed)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from face_prediction.prediction.errors import (
     normalised_mean_errors,
     skill,
 )
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
 

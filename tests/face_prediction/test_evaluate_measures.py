@@ -23,7 +23,7 @@ from face_prediction.evaluation.predictors import (
     DetectedPredictor,
     find_landmarks,
 )
-from face_prediction.forecast.simple import ConstantVelocity, Persistence
+from face_prediction.forecast.extrapolation import ConstantVelocity, Persistence
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.detector import FaceDetection
 from robo_manip_baselines.runs.errors import RequestError

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,12 +27,12 @@ from face_prediction.evaluation.predictors import (
     batch_size,
     cross_fit,
 )
-from face_prediction.motion.library import MotionLibrary, save_library
+from face_prediction.motion.library import RecordedMotion, save_motion
 from face_prediction.prediction.interface import Forecast, PictureNeeds
-from face_prediction.tracking.crop import crop_around
+from face_prediction.tracking.geometry import crop_around
 from face_prediction.tracking.tracks import save_track
-from face_prediction.tracking.video import sha256_of
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
 pytestmark = pytest.mark.long
 
@@ -69,7 +70,7 @@ def dataset(tmp_path_factory, make_track, write_video) -> Path:
         video = write_video(root / "videos" / f"{name}.mp4", images)
         # four videos of one content would be refused as one person under four names
         video.write_bytes(video.read_bytes() + name.encode())
-        source = {"name": video.name, "sha256": sha256_of(video)}
+        source = {"name": video.name, "sha256": file_digest(video)}
         save_track(root / "tracks" / f"{name}.npz", replace(track, source=source))
     words = ["build-dataset", root / "tracks", "--videos", root / "videos", "--out", root / "data"]
     words += ["--attribution", root / "clips.csv", "--history", HISTORY, "--future", FUTURE]
@@ -137,7 +138,7 @@ def test_a_crop_spans_what_its_edges_see(dataset: Path, project, number: int, cl
         span = median_crop_span(opened, [clip])
         row = opened.rows()[number]
     assert row.clip == clip
-    side = row.facts["crop_side"]
+    side = row.statistics["crop_side"]
     ends = np.array([[-span / 2, 0.0, -DEPTH], [span / 2, 0.0, -DEPTH]])
     left, right = project(ends, SIZE)[:, 0] * SIZE[0]
     assert right - left == pytest.approx(side, rel=1e-4)  # the depth is lifted, from float32
@@ -308,7 +309,7 @@ def predicted_library(tmp_path: Path) -> Path:
             last = start + count - 1
             come = np.minimum(np.arange(start, start + count) + h, last)
             ahead[start : start + count, h - 1] = mouth[come] + 1e-3 * np.array([h, -2 * h, 0])
-    library = MotionLibrary(
+    library = RecordedMotion(
         time=np.concatenate([np.arange(n) / 30 for n in frames]),
         mouth=mouth.astype(np.float32),
         orientation=np.tile(np.array([1, 0, 0, 0], np.float32), (sum(frames), 1)),
@@ -322,7 +323,7 @@ def predicted_library(tmp_path: Path) -> Path:
         predicted_mouth=ahead.astype(np.float32),
     )
     path = tmp_path / "library.npz"
-    save_library(path, library)
+    save_motion(path, library)
     return path
 
 
@@ -351,10 +352,15 @@ def test_a_library_is_measured_frame_by_frame(dataset: Path, tmp_path: Path) -> 
     ],
 )
 def test_a_library_that_cannot_be_measured_is_refused(
-    dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], words: str
+    dataset: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    exit_code: Callable[[list[str]], int],
+    options: list[str],
+    words: str,
 ) -> None:
     library, out = predicted_library(tmp_path), tmp_path / "stats.json"
     command = ["export-stats", "--dataset", str(dataset), "--library", str(library)]
-    assert main([*command, "--out", str(out), *options]) == 2
+    assert exit_code([*command, "--out", str(out), *options]) == 2
     assert words in caplog.text
     assert not out.exists()

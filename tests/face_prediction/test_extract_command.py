@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from face_prediction.commands import extract as extract_command
-from face_prediction.commands.cli import main
 from face_prediction.tracking import detector as detector_module
 from face_prediction.tracking import detector as model_file
 from face_prediction.tracking.detector import (
@@ -77,13 +76,13 @@ def stand_in(monkeypatch) -> type[StandIn]:
 
 
 @pytest.fixture
-def run(tmp_path: Path, model: Path, caplog):
+def run(tmp_path: Path, model: Path, caplog, exit_code):
     """Run ``extract`` and return its exit code; messages are in ``caplog``."""
     caplog.set_level(logging.INFO)
 
     def extract(*arguments: object) -> int:
         words = ["extract", *map(str, arguments), "--model", str(model), "--no_zoom"]
-        return main([*words, "--out", str(tmp_path / "tracks")])
+        return exit_code([*words, "--out", str(tmp_path / "tracks")])
 
     return extract
 
@@ -197,8 +196,8 @@ def test_bad_requests(run, caplog, arguments, message) -> None:
     assert len(caplog.messages) == 1
 
 
-def test_video_mode_and_zoom_exclude_one_another(model: Path, caplog) -> None:
-    assert main(["extract", "x.mp4", "--model", str(model), "--running_mode", "video"]) == 2
+def test_video_mode_and_zoom_exclude_one_another(model: Path, caplog, exit_code) -> None:
+    assert exit_code(["extract", "x.mp4", "--model", str(model), "--running_mode", "video"]) == 2
     assert "--no_zoom" in caplog.text
 
 

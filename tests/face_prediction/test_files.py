@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.motion.library import build_library, load_library, save_library
+from face_prediction.motion.library import join_runs, load_motion, save_motion
 from face_prediction.motion.motion import MotionSettings, lift
 from face_prediction.tracking.tracks import load_track, save_track
 from robo_manip_baselines.runs.errors import RequestError
@@ -35,8 +35,8 @@ def library_file(tmp_path: Path, make_track) -> Path:
     path = tmp_path / "face_motion.npz"
     settings = MotionSettings(min_run=1.0)
     first, second = (lift(make_track(mouth(n)), settings) for n in (50, 70))
-    library = build_library([("a", "ann", first), ("b", "bob", second)], {"note": "test"})
-    save_library(path, library)
+    library = join_runs([("a", "ann", first), ("b", "bob", second)], {"note": "test"})
+    save_motion(path, library)
     return path
 
 
@@ -55,7 +55,7 @@ def test_a_track_comes_back(track_file: Path, make_track) -> None:
 
 
 def test_a_library_comes_back(library_file: Path) -> None:
-    library = load_library(library_file)
+    library = load_motion(library_file)
     assert library.run_length.tolist() == [50, 70]
     assert library.run_start.tolist() == [0, 50]
     assert library.run_subject.tolist() == ["ann", "bob"]
@@ -129,13 +129,13 @@ def test_a_damaged_track_is_refused_by_name(track_file: Path, change, message: s
         (with_value("orientation", np.full((120, 4), 0.6)), "not of unit length"),
         (with_value("run_start", np.array([0, 40])), "do not divide the frames"),
         (with_value("run_length", np.array([50, 71])), "do not divide the frames"),
-        (with_value("metadata", "{"), "'metadata' is not JSON"),
+        (with_value("metadata", "{"), "'metadata' is not a JSON object"),
     ],
 )
 def test_a_damaged_library_is_refused_by_name(library_file: Path, change, message: str) -> None:
     edited(library_file, change)
     with pytest.raises(RequestError, match=message) as caught:
-        load_library(library_file)
+        load_motion(library_file)
     assert str(library_file) in str(caught.value)
 
 
@@ -186,7 +186,7 @@ def test_writing_is_whole_or_not_at_all(tmp_path: Path, monkeypatch) -> None:
 
 def test_an_unwritable_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(RequestError, match="cannot be written"):
+    with pytest.raises(RequestError, match="cannot write to"):
         write_npz(tmp_path / "file" / "out.npz", {"a": np.zeros(3)})
 
 
@@ -197,13 +197,13 @@ def test_mixed_rates_are_refused(make_track) -> None:
         for name, fps in (("a", 30.0), ("b", 25.0))
     ]
     with pytest.raises(RequestError, match=r"\[25.0, 30.0\]"):
-        build_library(clips, {})
+        join_runs(clips, {})
 
 
 def test_nothing_to_write(make_track) -> None:
     short = lift(make_track(mouth(10)), MotionSettings())
     with pytest.raises(RequestError, match="no run is long enough"):
-        build_library([("a", "a", short)], {})
+        join_runs([("a", "a", short)], {})
 
 
 def test_metadata_is_plain_json(library_file: Path) -> None:

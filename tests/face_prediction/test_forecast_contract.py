@@ -181,7 +181,7 @@ def test_wrong_request_is_named(
 
 
 def test_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(RequestError, match=r"'psychic'.*persistence.*kalman"):
+    with pytest.raises(RequestError, match=r"'psychic'.*kalman.*persistence"):
         restore_forecaster("psychic", {})
 
 

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from face_prediction.forecast import LandmarkSequences, mouth_centre
-from face_prediction.forecast.kalman import KalmanConstantVelocity, filter_gains, fit_noise
-from face_prediction.forecast.simple import ConstantVelocity
+from face_prediction.forecast.extrapolation import (
+    ConstantVelocity,
+    KalmanConstantVelocity,
+    filter_gains,
+    fit_noise,
+)
 from robo_manip_baselines.runs.errors import RequestError
 
 FACE = np.random.default_rng(5).uniform(0.2, 0.8, (468, 2))

@@ -9,18 +9,18 @@ from face_prediction.forecast import LandmarkSequences, mouth_centre
 from face_prediction.forecast.autoregression import (
     LandmarkAutoregression,
     MouthAutoregression,
-    choose,
     forecast,
     held_out_errors,
+    least_error,
     moments,
     principal_shapes,
     solve,
     spectral_radius,
     stabilised,
 )
+from face_prediction.forecast.extrapolation import ConstantVelocity, LineFit, Persistence
 from face_prediction.forecast.interface import subject_folds
-from face_prediction.forecast.simple import ConstantVelocity, Line, Persistence
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
 FACE = np.random.default_rng(5).uniform(0.2, 0.8, (468, 2))
@@ -68,10 +68,12 @@ def test_persistence_repeats_the_last_frame() -> None:
 
 
 @pytest.mark.parametrize(
-    "method", [ConstantVelocity(), ConstantVelocity(window=4), Line(), Line(frames=8)]
+    "method", [ConstantVelocity(), ConstantVelocity(window=4), LineFit(), LineFit(frames=8)]
 )
 @pytest.mark.parametrize("frames", [2, 3, 12])
-def test_uniform_motion_is_forecast_exactly(method: ConstantVelocity | Line, frames: int) -> None:
+def test_uniform_motion_is_forecast_exactly(
+    method: ConstantVelocity | LineFit, frames: int
+) -> None:
     truth = uniform_motion(frames + 5)
     np.testing.assert_allclose(method.predict(truth[:frames], 5), truth[frames:], atol=1e-14)
 
@@ -87,10 +89,10 @@ def test_line_is_that_of_polyfit() -> None:
     history = FACE + np.random.default_rng(7).normal(0, 0.01, (9, 468, 2))
     slope, level = np.polyfit(np.arange(5), history[-5:].reshape(5, -1), 1)
     expected = level + np.arange(5, 10)[:, None] * slope
-    np.testing.assert_allclose(Line().predict(history, 5), expected.reshape(5, 468, 2))
+    np.testing.assert_allclose(LineFit().predict(history, 5), expected.reshape(5, 468, 2))
 
 
-@pytest.mark.parametrize(("kind", "value"), [(ConstantVelocity, 0), (Line, 1)])
+@pytest.mark.parametrize(("kind", "value"), [(ConstantVelocity, 0), (LineFit, 1)])
 def test_useless_window_is_refused(kind: type, value: int) -> None:
     with pytest.raises(RequestError, match=str(value)):
         kind(value)
@@ -157,7 +159,8 @@ def test_order_is_chosen_on_other_people() -> None:
     series = ar_process(TRUE_AR, 200, 60, 13) * 1e-3
     subjects = tuple(f"s{i % 10}" for i in range(200))
     pairs = [(order, 2) for order in (1, 2, 12)]
-    assert choose(series, series, np.eye(2), subjects, pairs, 5) == (2, 2)
+    errors = held_out_errors(series, series, np.eye(2), subjects, pairs, 5)
+    assert least_error(errors) == (2, 2)
 
 
 def test_held_out_errors_are_those_of_a_slow_loop() -> None:
@@ -185,7 +188,8 @@ def test_order_that_only_suits_its_own_people_is_not_chosen() -> None:
     # with 6 short sequences sixteen lags fit their people by heart, and others badly
     noise = np.random.default_rng(14).normal(size=(6, 24, 2))
     subjects = ("a", "a", "a", "b", "b", "b")
-    assert choose(noise, noise, np.eye(2), subjects, [(1, 2), (16, 2)], 5) == (1, 2)
+    errors = held_out_errors(noise, noise, np.eye(2), subjects, [(1, 2), (16, 2)], 5)
+    assert least_error(errors) == (1, 2)
 
 
 def test_one_person_needs_an_order() -> None:

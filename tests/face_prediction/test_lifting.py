@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from face_prediction.tracking.lifting import (
+from face_prediction.tracking.geometry import (
     CANONICAL_MOUTH,
     LIPS,
     image_rays,

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.dataset.history_images import dataset_picture
-from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.forecast.simple import ConstantVelocity
+from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.sequences import SequenceSettings
+from face_prediction.forecast.extrapolation import ConstantVelocity
 from face_prediction.live.streaming import (
     LandmarkForecaster,
     LiveForecast,
@@ -18,7 +18,7 @@ from face_prediction.live.streaming import (
     StreamingPredictor,
 )
 from face_prediction.prediction.interface import Forecast, PictureNeeds
-from face_prediction.tracking.crop import Crop, crop_around
+from face_prediction.tracking.geometry import Crop, crop_around
 from robo_manip_baselines.runs.errors import RequestError
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.commands.cli import main
-from face_prediction.motion.library import load_library
+from face_prediction.motion.library import load_motion
 from face_prediction.motion.report import BEGIN, END
 from face_prediction.tracking.tracks import save_track
 
@@ -40,19 +39,19 @@ def folder(tmp_path: Path, make_track) -> Path:
 
 
 @pytest.fixture
-def run(folder: Path, caplog):
+def run(folder: Path, caplog, exit_code):
     caplog.set_level(logging.INFO)
 
     def export(*arguments: object, tracks: Path | None = None) -> int:
         words = ["export-motion", str(tracks or folder / "tracks"), *map(str, arguments)]
-        return main([*words, "--out", str(folder / "motion.npz"), "--min_run", "1"])
+        return exit_code([*words, "--out", str(folder / "motion.npz"), "--min_run", "1"])
 
     return export
 
 
 def test_only_clips_that_may_ship_are_in_the_library(folder: Path, run) -> None:
     assert run("--attribution", folder / "clips.csv") == 0
-    library = load_library(folder / "motion.npz")
+    library = load_motion(folder / "motion.npz")
     assert library.run_clip.tolist() == ["lively", "lively", "steady"]
     assert library.run_subject.tolist() == ["bob", "bob", "ann"]
     assert library.run_length.tolist() == [100, 99, 100]
@@ -78,7 +77,7 @@ def test_the_same_tracks_give_the_same_file(folder: Path, run) -> None:
 
 def test_without_a_table_nothing_is_claimed(folder: Path, run) -> None:
     assert run() == 0
-    attribution = load_library(folder / "motion.npz").metadata["attribution"]
+    attribution = load_motion(folder / "motion.npz").metadata["attribution"]
     assert {row["licence"] for row in attribution.values()} == {"not stated"}
 
 
@@ -113,10 +112,10 @@ def test_the_report(folder: Path, run) -> None:
         (("--min_run", "100"), "no run is long enough"),
     ],
 )
-def test_bad_requests(folder: Path, caplog, arguments, message) -> None:
+def test_bad_requests(folder: Path, caplog, exit_code, arguments, message) -> None:
     caplog.set_level(logging.INFO)
     words = ["export-motion", str(folder / "tracks"), "--out", str(folder / "m.npz"), *arguments]
-    assert main(words) == 2
+    assert exit_code(words) == 2
     assert message in caplog.text
     assert len(caplog.messages) == 1
     assert not (folder / "m.npz").exists()

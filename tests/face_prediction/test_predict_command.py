@@ -13,18 +13,17 @@ import pytest
 from face_prediction.commands import predict as predict_command
 from face_prediction.commands.cli import main
 from face_prediction.commands.predict import PredictOptions, run_predict
-from face_prediction.dataset.history_images import history_pictures
+from face_prediction.dataset.histories import find_origins, history_images
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import clip_frames
 from face_prediction.evaluation.predictors import EvaluatedPredictor, FittedPredictor
 from face_prediction.forecast import mouth_centre
-from face_prediction.motion.library import load_library, save_library
+from face_prediction.motion.library import load_motion, save_motion
 from face_prediction.prediction.interface import Forecast, PictureNeeds
-from face_prediction.prediction.predicted_motion import find_origins
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import FaceTrack, load_track, save_track
-from face_prediction.tracking.video import sha256_of
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
 pytestmark = pytest.mark.long
 
@@ -91,7 +90,7 @@ def made(tmp_path_factory, make_track, write_video) -> Path:
             root / "tracks" / f"{name}.npz",
             replace(
                 track,
-                source={"name": video.name, "sha256": sha256_of(video)},
+                source={"name": video.name, "sha256": file_digest(video)},
                 source_timestamps=times,
                 source_valid=np.ones(len(times), dtype=bool),
             ),
@@ -139,7 +138,7 @@ def use(monkeypatch, predictor, subjects=frozenset()) -> None:
 
 def test_persistence_is_the_mouth_itself(folder: Folder, capsys) -> None:
     assert run_predict(folder.options()) == 0
-    library = load_library(folder.root / "predicted.npz")
+    library = load_motion(folder.root / "predicted.npz")
     assert library.predicted_mouth is not None
     assert library.predicted_mouth.shape == (2 * FRAMES, 5, 3)
     assert library.predicted_mouth.dtype == np.float32
@@ -152,7 +151,7 @@ def test_persistence_is_the_mouth_itself(folder: Folder, capsys) -> None:
 
 def test_a_steady_face_is_forecast_where_it_will_be(folder: Folder) -> None:
     assert run_predict(folder.options(baseline="constant_velocity")) == 0
-    library = load_library(folder.root / "predicted.npz")
+    library = load_motion(folder.root / "predicted.npz")
     assert library.predicted_mouth is not None
     for index in range(2):
         run = library.run(index)
@@ -166,7 +165,7 @@ def test_a_steady_face_is_forecast_where_it_will_be(folder: Folder) -> None:
     assert record["mean_error_across_mm"]["all"]["forecast"][4] < 0.2  # of the first frame alone
     assert record["mean_error_across_mm"]["ann"]["persistence"][4] == pytest.approx(5.0, abs=0.01)
     assert record["history"] == HISTORY
-    assert record["dataset_sha256"] == sha256_of(folder.root / "data" / "dataset.json")
+    assert record["dataset_sha256"] == file_digest(folder.root / "data" / "dataset.json")
     assert record["checkpoint_sha256"] == {}
 
 
@@ -180,14 +179,14 @@ def test_what_export_motion_wrote_stays_as_it_was(folder: Folder) -> None:
         for key in set(before.files) - {"metadata"}:
             assert before[key].dtype == after[key].dtype
             np.testing.assert_array_equal(before[key], after[key])
-    metadata = load_library(folder.root / "predicted.npz").metadata
+    metadata = load_motion(folder.root / "predicted.npz").metadata
     del metadata["prediction"]
-    assert metadata == load_library(folder.root / "motion.npz").metadata
+    assert metadata == load_motion(folder.root / "motion.npz").metadata
 
 
 def test_only_clips_that_may_ship_are_written(folder: Folder) -> None:
     assert run_predict(folder.options()) == 0
-    library = load_library(folder.root / "predicted.npz")
+    library = load_motion(folder.root / "predicted.npz")
     assert library.run_clip.tolist() == ["ann", "bob"]
     assert "eve" not in str(library.metadata)
 
@@ -197,7 +196,7 @@ def test_without_a_library_one_is_made(folder: Folder, make_track) -> None:
         track = make_track(path_of(0, 380) * [0.1, 1.0, 1.0], image_size=SIZE, name=f"{name}.mp4")
         save_track(folder.root / "long" / f"{name}.npz", track)
     assert run_predict(folder.options(tracks=(folder.root / "long",), library=None)) == 0
-    library = load_library(folder.root / "predicted.npz")
+    library = load_motion(folder.root / "predicted.npz")
     assert library.run_clip.tolist() == ["ann"]  # eve's numbers may not be given away
     assert library.metadata["withheld_clips"] == 1
     assert library.run_length.tolist() == [380]
@@ -209,7 +208,7 @@ def test_without_a_library_one_is_made(folder: Folder, make_track) -> None:
 def test_pictures_are_read_from_the_video(folder: Folder, monkeypatch) -> None:
     use(monkeypatch, DotFollower())
     assert run_predict(folder.options()) == 0
-    library = load_library(folder.root / "predicted.npz")
+    library = load_motion(folder.root / "predicted.npz")
     assert library.predicted_mouth is not None
     run = library.run(0)
     mouth, ahead = library.mouth[run], library.predicted_mouth[run]
@@ -231,7 +230,7 @@ def test_histories_are_those_of_the_dataset(folder: Folder) -> None:
         origins = find_origins(
             last, frames.landmarks, SIZE, frames.quality, HISTORY, settings.margin
         )
-        seen = history_pictures(
+        seen = history_images(
             folder.root / "videos" / "bob.mp4",
             track,
             frames.source_frame,
@@ -276,15 +275,15 @@ def test_somebody_in_no_fold_is_refused(folder: Folder, make_track) -> None:
 
 
 def test_a_library_of_other_tracks_is_refused(folder: Folder, make_track) -> None:
-    library = load_library(folder.root / "motion.npz")
+    library = load_motion(folder.root / "motion.npz")
     moved = replace(library, mouth=library.mouth + np.float32(1e-4))
-    save_library(folder.root / "moved.npz", moved)
+    save_motion(folder.root / "moved.npz", moved)
     with pytest.raises(RequestError, match="its 'mouth' is not what these tracks give"):
         run_predict(folder.options(library=folder.root / "moved.npz"))
     only = (folder.root / "tracks" / "ann.npz",)
     with pytest.raises(RequestError, match="no track with ship=yes of its clips bob"):
         run_predict(folder.options(tracks=only))
-    save_library(folder.root / "blank.npz", replace(library, metadata={}))
+    save_motion(folder.root / "blank.npz", replace(library, metadata={}))
     with pytest.raises(RequestError, match="no settings of export-motion"):
         run_predict(folder.options(library=folder.root / "blank.npz"))
 
@@ -339,12 +338,12 @@ def test_a_library_with_damaged_forecasts_is_refused(folder: Folder, caplog) -> 
     caplog.set_level(logging.INFO)
     assert run_predict(folder.options()) == 0
     path = folder.root / "predicted.npz"
-    library = load_library(path)
+    library = load_motion(path)
     assert library.predicted_mouth is not None
     library.predicted_mouth[3, 1, 2] = np.nan
-    save_library(path, library)
+    save_motion(path, library)
     with pytest.raises(RequestError, match="'predicted_mouth' holds NaN"):
-        load_library(path)
-    save_library(path, replace(library, predicted_mouth=np.zeros((7, 5, 3), dtype=np.float32)))
+        load_motion(path)
+    save_motion(path, replace(library, predicted_mouth=np.zeros((7, 5, 3), dtype=np.float32)))
     with pytest.raises(RequestError, match=r"'predicted_mouth' is float32 \(7, 5, 3\)"):
-        load_library(path)
+        load_motion(path)

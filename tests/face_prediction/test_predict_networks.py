@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.live import load_forecaster
-from face_prediction.dataset.history_images import dataset_picture
+from face_prediction.dataset.histories import dataset_picture
 from face_prediction.dataset.manifest import ClipEntry, Manifest, write_manifest
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.settings import SequenceSettings
+from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.evaluation.predictors import cross_fit
 from face_prediction.live.streaming import StreamingPredictor
-from face_prediction.tracking.video import sha256_of
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 pytestmark = pytest.mark.long
@@ -60,7 +60,7 @@ def trained(tmp_path: Path, dataset: Path) -> Callable[..., Path]:
                 "training": {},
                 "seed": 0,
                 "dataset": SETTINGS.to_json(),
-                "dataset_sha256": sha256_of(dataset / "dataset.json"),
+                "dataset_sha256": file_digest(dataset / "dataset.json"),
                 "folds": {"train": [], "validation": [], "test": [fold]},
                 "train_subjects": [name for name, own in FOLDS.items() if own != fold],
                 "step": 1,

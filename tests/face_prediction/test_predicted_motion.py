@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from face_prediction.forecast import mouth_centre
-from face_prediction.motion.motion import Quality
-from face_prediction.prediction.predicted_motion import (
+from face_prediction.dataset.histories import (
     Origin,
     crop_history,
     errors_across,
@@ -16,8 +14,9 @@ from face_prediction.prediction.predicted_motion import (
     image_points,
     mouth_ahead,
 )
-from face_prediction.tracking.crop import Crop, crop_around
-from face_prediction.tracking.lifting import mouth_centres
+from face_prediction.forecast import mouth_centre
+from face_prediction.motion.motion import Quality
+from face_prediction.tracking.geometry import Crop, crop_around, mouth_centres
 
 SIZE = (640, 480)
 

@@ -11,11 +11,13 @@ from face_prediction.commands.cli import main
 from face_prediction.motion.motion import step_tremor
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector
 from face_prediction.tracking.geometry import (
+    CANONICAL_MOUTH,
+    LIPS,
     head_pose_from_landmarks,
+    mouth_centres,
     read_canonical_face,
     rigid_face,
 )
-from face_prediction.tracking.lifting import CANONICAL_MOUTH, LIPS, mouth_centres
 from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import VideoReader
 
@@ -118,9 +120,9 @@ def test_our_pose_is_mediapipes(clips: Path, model: Path) -> None:
             np.testing.assert_allclose(pose, found.head_pose, atol=2e-5)
 
 
-def test_a_model_of_another_kind_is_refused(clips: Path, tmp_path: Path, caplog) -> None:
+def test_a_model_of_another_kind_is_refused(clips: Path, tmp_path: Path, caplog, exit_code) -> None:
     path = tmp_path / "face_landmarker.task"
     path.write_bytes(b"no model")
     words = ["extract", str(clips / "carphone.mp4"), "--model", str(path), "--out", str(tmp_path)]
-    assert main(words) == 2
+    assert exit_code(words) == 2
     assert "cannot load it as a face landmarker model" in caplog.text

@@ -11,7 +11,7 @@ from face_prediction.forecast import LandmarkSequences
 from face_prediction.models.interface import Future, History
 from face_prediction.models.residual.model import ResidualModel, cut_out, flow, warp
 from face_prediction.models.settings import ResidualSettings, preset_settings
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
 
 S = 32

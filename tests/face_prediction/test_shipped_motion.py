@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from face_prediction.motion.library import MotionLibrary, load_library
+from face_prediction.motion.library import RecordedMotion, load_motion
 from face_prediction.motion.report import BEGIN, END, tables
 from face_prediction.tracking.geometry import rotation_angle
 
@@ -22,11 +22,11 @@ def path(repository: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def library(path: Path) -> MotionLibrary:
-    return load_library(path)
+def library(path: Path) -> RecordedMotion:
+    return load_motion(path)
 
 
-def test_three_minutes_of_five_people_in_runs_of_twelve_seconds(library: MotionLibrary) -> None:
+def test_three_minutes_of_five_people_in_runs_of_twelve_seconds(library: RecordedMotion) -> None:
     assert library.fps == 30.0
     assert library.seconds >= 180.0
     assert len(set(library.run_subject.tolist())) >= 5
@@ -37,7 +37,7 @@ def test_it_is_small(path: Path) -> None:
     assert path.stat().st_size < 1_000_000
 
 
-def test_every_permitted_start_keeps_the_mouth_within_reach(library: MotionLibrary) -> None:
+def test_every_permitted_start_keeps_the_mouth_within_reach(library: RecordedMotion) -> None:
     for index in range(len(library.run_start)):
         mouth = library.mouth[library.run(index)].astype(float)
         for start in range(len(mouth) - WINDOW + 1):
@@ -45,12 +45,12 @@ def test_every_permitted_start_keeps_the_mouth_within_reach(library: MotionLibra
             assert np.abs(moved).max() <= REACH + 1e-6  # stored as float32
 
 
-def test_heads_face_the_camera(library: MotionLibrary) -> None:
+def test_heads_face_the_camera(library: RecordedMotion) -> None:
     angle = np.degrees(rotation_angle(library.orientation, np.array([1.0, 0, 0, 0])))
     assert angle.max() <= FACING + 1e-3  # stored as float32
 
 
-def test_motion_is_what_a_head_can_do(library: MotionLibrary) -> None:
+def test_motion_is_what_a_head_can_do(library: RecordedMotion) -> None:
     limits = library.metadata["settings"]["limits"]
     for index in range(len(library.run_start)):
         part = library.run(index)
@@ -65,11 +65,11 @@ def test_motion_is_what_a_head_can_do(library: MotionLibrary) -> None:
         assert library.jaw[part].max() < 0.06  # a wide yawn
 
 
-def test_the_mouth_is_before_the_camera(library: MotionLibrary) -> None:
+def test_the_mouth_is_before_the_camera(library: RecordedMotion) -> None:
     assert library.mouth[:, 2].max() < -0.1
 
 
-def test_every_clip_is_attributed_and_every_cut_counted(library: MotionLibrary) -> None:
+def test_every_clip_is_attributed_and_every_cut_counted(library: RecordedMotion) -> None:
     clips = set(library.run_clip.tolist())
     assert set(library.metadata["attribution"]) == clips
     for row in library.metadata["attribution"].values():
@@ -85,7 +85,7 @@ def test_every_clip_is_attributed_and_every_cut_counted(library: MotionLibrary) 
         assert detector["smoothed"] is False
 
 
-def test_the_page_shows_this_library(library: MotionLibrary, repository: Path) -> None:
+def test_the_page_shows_this_library(library: RecordedMotion, repository: Path) -> None:
     page = repository / "docs/face_motion.md"
     text = page.read_text(encoding="utf-8")
     generated = text.split(BEGIN)[1].split(END)[0]

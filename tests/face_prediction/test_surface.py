@@ -15,17 +15,22 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
-from face_prediction.commands import export_surface as surface
-from face_prediction.commands.export_surface import ExportSurfaceOptions, Topology, export_surface
+from face_prediction.commands import export_surface as surface_command
+from face_prediction.commands.export_surface import ExportSurfaceOptions, run_export_surface
 from face_prediction.motion.surface import (
     CANONICAL_MEAN,
+    Topology,
     align,
     align_subjects,
     closed_mean,
+    facing_out,
     fit_jaw,
+    measure,
+    mediapipe_topology,
     metric_landmarks,
     mirror_partners,
     opening_velocity,
+    ordered_loops,
     symmetric,
 )
 from face_prediction.tracking.tracks import FaceTrack, save_track
@@ -143,7 +148,7 @@ def test_a_known_face_and_its_jaw_are_found_again(
         pose = poses(rng, 60)
         noise = rng.normal(0, 0.0003, faces.shape)
         subjects.append(metric_landmarks(project(faces + noise, pose, SIZE), pose, SIZE))
-    vertices, jaw = surface.measure(subjects, topology)
+    vertices, jaw = measure(subjects, topology)
     # six people of 2 % different build, and 60 frames each with 0.3 mm of noise
     error = np.linalg.norm(vertices - shipped["vertices"], axis=1)
     assert np.sqrt(np.mean(error**2)) < 0.002
@@ -168,7 +173,7 @@ def test_a_smile_is_not_taken_for_an_opening(shipped: dict[str, np.ndarray]) -> 
 
 def test_no_opening_mouth_is_an_error(shipped: dict[str, np.ndarray], topology: Topology) -> None:
     with pytest.raises(RequestError, match="no mouth opens"):
-        surface.measure([opened(shipped, np.zeros(20))], topology)
+        measure([opened(shipped, np.zeros(20))], topology)
 
 
 def test_weights_obey_their_anchors(shipped: dict[str, np.ndarray], topology: Topology) -> None:
@@ -191,7 +196,7 @@ def test_mirroring(shipped: dict[str, np.ndarray]) -> None:
 def test_ordered_loops() -> None:
     square = [(1, 2), (4, 3), (2, 3), (4, 1)]
     triangle = [(10, 12), (11, 12), (11, 10)]
-    loops = surface.ordered_loops(np.array(square + triangle))
+    loops = ordered_loops(np.array(square + triangle))
     assert sorted(map(sorted, loops)) == [[1, 2, 3, 4], [10, 11, 12]]
     sides = [{a, b} for a, b in zip(loops[0], loops[0][1:] + loops[0][:1], strict=True)]
     assert all(set(edge) in sides for edge in square)
@@ -209,12 +214,12 @@ def test_triangles_are_turned_to_face_outward(seed: int) -> None:
     def rolled(rows: np.ndarray) -> list[tuple[int, ...]]:
         return [tuple(np.roll(row, -row.argmin()).tolist()) for row in rows]
 
-    assert rolled(surface.facing_out(flipped, vertices)) == rolled(triangles)
+    assert rolled(facing_out(flipped, vertices)) == rolled(triangles)
 
 
 def test_mediapipe_knows_the_shipped_mesh(shipped: dict[str, np.ndarray]) -> None:
     pytest.importorskip("mediapipe", reason="the extra face_prediction is not installed")
-    found = surface.mediapipe_topology()
+    found = mediapipe_topology()
     assert found.triangles.shape == (852, 3)
     assert {frozenset(t) for t in found.triangles.tolist()} == {
         frozenset(t) for t in shipped["triangles"].tolist()
@@ -229,7 +234,7 @@ def test_mediapipe_knows_the_shipped_mesh(shipped: dict[str, np.ndarray]) -> Non
 @pytest.fixture
 def known_mesh(topology: Topology, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The mesh without MediaPipe, which a fast test must not need."""
-    monkeypatch.setattr(surface, "mediapipe_topology", lambda: topology)
+    monkeypatch.setattr(surface_command, "mediapipe_topology", lambda: topology)
     return
 
 
@@ -263,7 +268,7 @@ def test_export_keeps_to_the_schema(
     )
     out = tmp_path / "face_surface.npz"
     options = ExportSurfaceOptions((tmp_path / "tracks",), out=out, attribution=table)
-    assert export_surface(options) == 0
+    run_export_surface(options)
     with np.load(out, allow_pickle=False) as file:
         made = dict(file)
     with np.load(SHIPPED, allow_pickle=False) as file:
@@ -298,7 +303,7 @@ def test_bad_requests_leave_nothing_behind(
     write_track("a")
     options = {"tracks": (tmp_path / "tracks",), "out": tmp_path / "s.npz", **change}
     with pytest.raises(RequestError, match=message) as caught:
-        export_surface(ExportSurfaceOptions(**options))
+        run_export_surface(ExportSurfaceOptions(**options))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "s.npz").exists()
 
@@ -308,4 +313,4 @@ def test_without_mediapipe_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(
         RequestError, match=r"pip install 'robo_manip_baselines\[face_prediction\]'"
     ):
-        surface.mediapipe_topology()
+        mediapipe_topology()

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.tracking.video import VideoReader, require_video, sha256_of
+from face_prediction.tracking.video import VideoReader, require_video
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
 
 pytestmark = pytest.mark.long
 
@@ -102,4 +103,4 @@ def test_hash_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "abc"
     path.write_bytes(b"abc")
     # FIPS 180-2, appendix B.1
-    assert sha256_of(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert file_digest(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"

@@ -11,15 +11,15 @@ from scipy.spatial.transform import Rotation
 from face_prediction.tracking.detector import FaceDetection
 from face_prediction.tracking.extract import (
     FaceFollower,
-    Window,
     ZoomingDetector,
-    face_box,
+    is_well_inside,
     search_windows,
     whole_image_detection,
     window_around,
 )
 from face_prediction.tracking.geometry import (
     CanonicalFace,
+    Crop,
     head_pose_from_landmarks,
     read_canonical_face,
     rigid_face,
@@ -91,11 +91,11 @@ def blob(left: float, top: float, width: float, image_size: tuple[int, int]) -> 
 
 def test_a_face_in_a_window_is_put_where_it_is_in_the_image() -> None:
     size = (1280, 720)
-    window = Window(left=400, top=100, side=200)
+    window = Crop(left=400, top=100, side=200)
     inside = blob(50, 60, 80, (200, 200))
     inside.landmarks[:, 2] = 0.1  # a tenth of the window's width
     whole = whole_image_detection(inside, window, size, canonical())
-    centre, width = face_box(whole, size)
+    centre, width = whole.box(size)
     np.testing.assert_allclose(centre, (490, 200))
     assert width == pytest.approx(80)
     np.testing.assert_allclose(whole.landmarks[:, 2], 0.1 * 200 / 1280)
@@ -104,9 +104,9 @@ def test_a_face_in_a_window_is_put_where_it_is_in_the_image() -> None:
 @pytest.mark.parametrize(
     ("centre", "width", "expected"),
     [
-        ((640, 360), 100, Window(490, 210, 300)),
+        ((640, 360), 100, Crop(490, 210, 300)),
         ((640, 360), 256, None),  # a fifth of the longer side: large enough
-        ((10, 700), 100, Window(0, 420, 300)),  # kept inside the image
+        ((10, 700), 100, Crop(0, 420, 300)),  # kept inside the image
         ((640, 360), 240, None),  # three faces would be the whole height
     ],
 )
@@ -119,9 +119,9 @@ def test_window_around(centre, width, expected) -> None:
     [(0, 100, True), (59, 100, True), (61, 100, False), (0, 141, False), (0, 71, False)],
 )
 def test_a_window_stands_still_until_the_face_has_left_its_middle(offset, width, fits) -> None:
-    window = Window(490, 210, 300)
-    assert window.fits(np.array([640 + offset, 360]), width) == fits
-    assert window.fits(np.array([640, 360 - offset]), width) == fits
+    window = Crop(490, 210, 300)
+    assert is_well_inside(window, np.array([640 + offset, 360]), width) == fits
+    assert is_well_inside(window, np.array([640, 360 - offset]), width) == fits
 
 
 @pytest.mark.parametrize("image_size", [(1280, 720), (720, 1280), (90, 90), (3, 2)])
@@ -130,7 +130,7 @@ def test_search_windows_cover_the_image(image_size) -> None:
     for window in search_windows(image_size):
         assert window.left >= 0
         assert window.top >= 0
-        part = window.cut(np.ones((*image_size[::-1], 3), dtype=np.uint8))
+        part = window.region(np.ones((*image_size[::-1], 3), dtype=np.uint8))
         assert part.shape == (window.side, window.side, 3)
         covered[window.top : window.top + window.side, window.left : window.left + window.side] = (
             True
@@ -168,7 +168,7 @@ def test_a_small_face_is_searched_for_then_followed_through_a_window() -> None:
         faces = zooming.detect(image, index / 30)
         assert len(faces) == 1
         face = zooming.refine(faces[0], image, index / 30)
-        centre, width = face_box(face, (1280, 720))
+        centre, width = face.box((1280, 720))
         np.testing.assert_allclose(centre, (630 + 2 * index, 330), atol=1e-6)
         assert width == pytest.approx(60)
     assert zooming.frames == 39  # all but the first, which was searched for

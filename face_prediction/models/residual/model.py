@@ -21,7 +21,7 @@ from face_prediction.models.interface import Future, History, Losses, Output, Pr
 from face_prediction.models.residual.prior import AdaptivePrior, PriorForecast
 from face_prediction.models.settings import ResidualSettings
 from face_prediction.prediction.interface import PictureNeeds
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 _LIPS: list[int] = list(LIPS)

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from face_prediction.forecast.autoregression import principal_shapes
 from face_prediction.forecast.interface import LandmarkSequences
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 # Fit to the training people

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,10 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from face_prediction.commands.cli import main
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import FaceTrack, save_track
-from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.files import file_digest
 
 SIZE = (320, 240)
 TABLE = """clip,subject,ship,licence,source,what
@@ -39,19 +39,20 @@ def draw(track: FaceTrack) -> list[np.ndarray]:
 @dataclass
 class Folder:
     root: Path
+    exit_code: Callable[[Sequence[str]], int]
     table: str = TABLE
 
     def run(self, *options: object, out: str = "dataset") -> int:
         words = ["build-dataset", self.root / "tracks", "--videos", self.root / "videos"]
         words += ["--attribution", self.root / "clips.csv", "--out", self.root / out]
-        return main([*map(str, words), "--no_progress", *SMALL, *map(str, options)])
+        return self.exit_code([*map(str, words), "--no_progress", *SMALL, *map(str, options)])
 
     def clip(self, name: str, out: str = "dataset") -> Path:
         return self.root / out / "clips" / f"{name}.h5"
 
 
 @pytest.fixture
-def folder(tmp_path: Path, make_track, write_video, caplog) -> Folder:
+def folder(tmp_path: Path, make_track, write_video, caplog, exit_code) -> Folder:
     caplog.set_level(logging.INFO)
     (tmp_path / "videos").mkdir()
     (tmp_path / "clips.csv").write_text(TABLE)
@@ -62,6 +63,6 @@ def folder(tmp_path: Path, make_track, write_video, caplog) -> Folder:
         mouth[:, 1] = 0.01 * np.cos(np.arange(frames) / 5)
         track = make_track(mouth, image_size=SIZE, name=f"{name}.mp4")
         video = write_video(tmp_path / "videos" / f"{name}.mp4", draw(track))
-        source = {"name": video.name, "sha256": sha256_of(video)}
+        source = {"name": video.name, "sha256": file_digest(video)}
         save_track(tmp_path / "tracks" / f"{name}.npz", replace(track, source=source))
-    return Folder(tmp_path)
+    return Folder(tmp_path, exit_code)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.cli import main
-from face_prediction.dataset.build import cut_pictures
+from face_prediction.dataset.build import cut_images
 from face_prediction.dataset.manifest import read_manifest
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.dataset.sequences import SequenceSettings, clip_frames, find_sequences
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import save_track
-from face_prediction.tracking.video import VideoReader, sha256_of
+from face_prediction.tracking.video import VideoReader
+from robo_manip_baselines.runs.files import file_digest
 
 pytestmark = pytest.mark.long
 
@@ -66,7 +66,9 @@ def test_the_whole_way(folder, capsys) -> None:
         rows = dataset.rows()
     assert len(table) == len(rows) == 18
     assert [row["clip"] for row in table] == [row.clip for row in rows]
-    assert float(table[8]["mouth_range_x"]) == pytest.approx(rows[8].facts["mouth_range_x"], 1e-5)
+    assert float(table[8]["mouth_range_x"]) == pytest.approx(
+        rows[8].statistics["mouth_range_x"], 1e-5
+    )
     shown = capsys.readouterr().out
     assert "| natural | 1 | 2 | 0 | 7 | 0 | 0 | 0 |" in shown
     assert "| head_motion | 1 | 1 | 0 | 5 |" in shown
@@ -141,7 +143,7 @@ def test_frames_of_one_decoded_picture_share_it(tmp_path, make_track, write_vide
     settings = SequenceSettings(history=8, future=2, stride=4, crop_size=32)
     frames = clip_frames(track, settings)
     sequences = find_sequences(frames, settings)
-    pictures = cut_pictures(path, track, frames, sequences, settings)
+    pictures = cut_images(path, track, frames, sequences, settings)
     # thirty a second of twenty: 0, 1/2 -> 0, 1, 2, 2, 3, 4, 4, 5, 6
     assert frames.source_frame[:10].tolist() == [0, 1, 1, 2, 3, 3, 4, 5, 5, 6]
     assert pictures.index[0].tolist() == [0, 1, 1, 2, 3, 3, 4, 5, 5, 6]
@@ -175,7 +177,7 @@ def test_a_track_that_does_not_fit_its_video(folder, make_track, caplog, change)
     size = (640, 480) if change == "size" else SIZE
     track = make_track(np.tile([0.0, 0.0, -0.5], (frames, 1)), image_size=size)
     times = track.source_timestamps + (0.01 if change == "clock" else 0.0)
-    source = {"name": "one.mp4", "sha256": sha256_of(video)}
+    source = {"name": "one.mp4", "sha256": file_digest(video)}
     track = replace(track, source=source, source_timestamps=times)
     save_track(folder.root / "tracks" / "one.npz", track)
     assert folder.run() == 2
@@ -193,7 +195,7 @@ def test_a_track_without_faces_and_a_missing_video(folder, make_track, caplog) -
     video = folder.root / "videos" / "one.mp4"
     mouth = np.tile([0.0, 0.0, -0.5], (20, 1))
     track = make_track(mouth, valid=np.zeros(20, dtype=bool), image_size=SIZE)
-    source = {"name": "one.mp4", "sha256": sha256_of(video)}
+    source = {"name": "one.mp4", "sha256": file_digest(video)}
     save_track(folder.root / "tracks" / "one.npz", replace(track, source=source))
     (folder.root / "videos" / "two.mp4").unlink()
     assert folder.run("--folds", 2) == 2

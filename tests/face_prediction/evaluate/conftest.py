@@ -18,9 +18,9 @@ from face_prediction.evaluation.predictors import FittedPredictor
 from face_prediction.forecast.interface import mouth_centre
 from face_prediction.prediction.interface import Forecast, PictureNeeds
 from face_prediction.tracking.detector import FaceDetection
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import FaceTrack, save_track
-from face_prediction.tracking.video import sha256_of
+from robo_manip_baselines.runs.files import file_digest
 
 SIZE = (320, 240)
 TABLE = """clip,subject,ship,licence,source,what
@@ -58,7 +58,7 @@ def dataset(make_track, write_video, tmp_path_factory) -> Path:
         mouth[:, :2] = np.cumsum(0.002 * np.cos(np.arange(frames) / 4 + number)[:, None] + step, 0)
         track = make_track(mouth, image_size=SIZE, name=f"{name}.mp4")
         video = write_video(root / "videos" / f"{name}.mp4", draw(track))
-        source = {"name": video.name, "sha256": sha256_of(video)}
+        source = {"name": video.name, "sha256": file_digest(video)}
         save_track(root / "tracks" / f"{name}.npz", replace(track, source=source))
     words = ["build-dataset", root / "tracks", "--videos", root / "videos"]
     words += ["--attribution", root / "clips.csv", "--out", root / "dataset", "--no_progress"]
@@ -136,7 +136,7 @@ def toys(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Toy]:
         found[f"careless_{fold}"] = Toy("careless", fold, people[fold], reads=False)
 
     def load(folder: Path, dataset_sha256: str) -> FittedPredictor:
-        assert dataset_sha256 == sha256_of(dataset / "dataset.json")
+        assert dataset_sha256 == file_digest(dataset / "dataset.json")
         toy = found[folder.name]
         record = {"name": toy.name, "preset": toy.preset, "test_fold": toy.test_fold}
         return FittedPredictor(

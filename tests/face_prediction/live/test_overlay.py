@@ -8,7 +8,7 @@ import pytest
 from face_prediction.live.display import FAR, GREEN, NEAR, draw_mouth, draw_text
 from face_prediction.live.loop import LiveStatistics, captions, run_loop
 from face_prediction.live.streaming import LiveForecast
-from face_prediction.tracking.crop import Crop
+from face_prediction.tracking.geometry import Crop
 from face_prediction.tracking.video import VideoFrame
 
 pytestmark = pytest.mark.long

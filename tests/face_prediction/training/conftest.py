@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.train import run_train
-from face_prediction.dataset.clip_file import EncodedPictures, encode_picture, write_clip
-from face_prediction.dataset.manifest import ClipEntry, Manifest, sequence_facts, write_manifest
+from face_prediction.dataset.clip_file import EncodedImages, encode_image, write_clip
+from face_prediction.dataset.manifest import ClipEntry, Manifest, sequence_statistics, write_manifest
 from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.settings import SequenceSettings
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.dataset.sequences import SequenceSettings
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.training import setup as job
 from face_prediction.training import trainer as trainer_module
 from face_prediction.training.options import FaceTrainOptions
@@ -42,7 +42,7 @@ def face_pictures(landmarks: np.ndarray) -> list[np.ndarray]:
     for u, v in landmarks[:, list(LIPS), :2].mean(axis=1):
         picture = np.full((64, 64, 3), 90, dtype=np.uint8)
         cv2.circle(picture, (round(u * 1024), round(v * 1024)), 64, (250, 30, 30), -1, shift=4)
-        pictures.append(encode_picture(picture, 95))
+        pictures.append(encode_image(picture, 95))
     return pictures
 
 
@@ -68,8 +68,8 @@ def make_dataset(folder: Path, make_track) -> Path:
             folder / "clips" / f"{name}.h5",
             frames,
             sequences,
-            EncodedPictures(encoded, index),
-            sequence_facts(frames, sequences, SEQUENCES),
+            EncodedImages(encoded, index),
+            sequence_statistics(frames, sequences, SEQUENCES),
             {**record, "settings": SEQUENCES.to_json()},
         )
         entries.append(entry)

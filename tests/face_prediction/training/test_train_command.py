@@ -19,7 +19,7 @@ from face_prediction.evaluation import mouth_distances, mouth_residuals
 from face_prediction.models.checkpoint import read_predictor_checkpoint, read_tensors
 from face_prediction.models.learned import LearnedPredictor
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
-from face_prediction.tracking.lifting import LIPS
+from face_prediction.tracking.geometry import LIPS
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import WindowBatch
 from robo_manip_baselines.runs.errors import RequestError

@@ -1,14 +1,4 @@
-"""A Kalman filter of constant velocity whose noise is fitted by maximum likelihood.
-
-Each coordinate of each landmark has the state (position, velocity). From one frame to the next
-
-    position += velocity,    covariance of the disturbance  q [[1/3, 1/2], [1/2, 1]]
-
-(white acceleration of density q, Bar-Shalom, Li, Kirubarajan 2001, 6.2.2), and the detector adds
-white noise of variance r. Before the first frame nothing is known of the position; the velocity is
-0 with variance v. All three are for the mouth centre, an axis each, and serve every landmark: the
-gains of the filter then are the same for all, so the filtered mouth centre is the mean of the
-filtered lips.
+"""Forecasts that extrapolate each landmark by itself: still, at constant velocity, filtered.
 
 Legend: N sequences, B batch, T frames, H horizon, L landmarks; axes are u and v of the crop.
 """
@@ -21,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from face_prediction.forecast.interface import Array, Forecaster, LandmarkSequences, mouth_centre
 from robo_manip_baselines.runs.errors import RequestError
@@ -31,21 +20,122 @@ if TYPE_CHECKING:
 
 _TRANSITION = np.array([[1.0, 1.0], [0.0, 1.0]])
 _DISTURBANCE = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
-#: Crops squared: below what float32 coordinates resolve; keeps the fit to a still face finite.
+# Crops squared: below what float32 coordinates resolve; keeps the fit to a still face finite.
 _SMALLEST_VARIANCE = 1e-14
-#: log10 of q / r and v / r: from a mouth at rest to a detector without noise
+# log10 of q / r and v / r: from a mouth at rest to a detector without noise
 _BOUNDS = ((-8.0, 6.0), (-6.0, 10.0))
+
+
+class _Unfitted(Forecaster):
+    """A forecaster without parameters to fit."""
+
+    @classmethod
+    def fit(cls, sequences: LandmarkSequences) -> Self:
+        """Nothing is fitted."""
+        return cls()
+
+
+@dataclass(frozen=True)
+class Persistence(_Unfitted):
+    """Every future frame is the last one seen."""
+
+    name = "persistence"
+
+    @property
+    def memory(self) -> int:
+        """The last frame."""
+        return 1
+
+    def _forecast(self, history: Array, horizon: int) -> NDArray[np.float64]:
+        return np.repeat(history[:, -1:].astype(np.float64), horizon, axis=1)
+
+
+@dataclass(frozen=True)
+class ConstantVelocity(_Unfitted):
+    """Each landmark keeps its mean velocity over the last ``window`` frames.
+
+    velocity = (last frame - frame ``window`` before it) / window, in crops a frame; with fewer
+    frames the whole history is the window, and one frame has velocity 0.
+
+    Attributes:
+        window: frames of the velocity; 1 is the last step alone.
+    """
+
+    window: int = 1
+
+    name = "constant_velocity"
+
+    def __post_init__(self) -> None:
+        if self.window < 1:
+            raise RequestError(f"constant_velocity: window {self.window}; must be 1 or more frames")
+
+    @property
+    def memory(self) -> int:
+        """The window and the last frame."""
+        return self.window + 1
+
+    def _forecast(self, history: Array, horizon: int) -> NDArray[np.float64]:
+        last = history[:, -1].astype(np.float64)
+        velocity = (last - history[:, 0]) / max(history.shape[1] - 1, 1)
+        return last[:, None] + _ahead(horizon) * velocity[:, None]
+
+
+@dataclass(frozen=True)
+class LineFit(_Unfitted):
+    """The least-squares line through each landmark's last ``frames`` frames, prolonged.
+
+    It smooths position and velocity; one frame has velocity 0.
+    """
+
+    frames: int = 5
+
+    name = "line"
+
+    def __post_init__(self) -> None:
+        if self.frames < 2:
+            raise RequestError(f"line: {self.frames} frames; must be 2 or more")
+
+    @property
+    def memory(self) -> int:
+        """The frames of the line."""
+        return self.frames
+
+    def _forecast(self, history: Array, horizon: int) -> NDArray[np.float64]:
+        frames = history.shape[1]
+        time = np.arange(frames) - (frames - 1) / 2  # about the middle of the line
+        spread = float(time @ time) or 1.0  # one frame: no spread, and no velocity
+        velocity = np.einsum("t,btlc->blc", time / spread, history)
+        middle = history.mean(axis=1, dtype=np.float64)
+        return middle[:, None] + ((frames - 1) / 2 + _ahead(horizon)) * velocity[:, None]
+
+
+def _ahead(horizon: int) -> NDArray[np.float64]:
+    """Frames ahead, 1 to H, as (1, H, 1, 1)."""
+    return np.arange(1.0, horizon + 1)[None, :, None, None]
 
 
 @dataclass(frozen=True)
 class KalmanConstantVelocity(Forecaster):
-    """Constant velocity, the velocity and the position estimated by a Kalman filter."""
+    """Constant velocity, the velocity and the position estimated by a Kalman filter.
 
-    #: (2,) q of u and v, crops^2 / frame^3
+    Each coordinate of each landmark has the state (position, velocity). From one frame to the next
+
+        position += velocity,    covariance of the disturbance  q [[1/3, 1/2], [1/2, 1]]
+
+    (white acceleration of density q, Bar-Shalom, Li, Kirubarajan 2001, 6.2.2), and the detector
+    adds white noise of variance r. Before the first frame nothing is known of the position; the
+    velocity is 0 with variance v. All three are fitted to the mouth centre by maximum likelihood,
+    an axis each, and serve every landmark: the gains of the filter then are the same for all, so
+    the filtered mouth centre is the mean of the filtered lips.
+
+    Attributes:
+        process: (2,) q of u and v, crops^2 / frame^3.
+        measurement: (2,) r of u and v, crops^2.
+        velocity: (2,) variance of the velocity before the first frame, (crops / frame)^2.
+    """
+
     process: NDArray[np.float64]
-    #: (2,) r of u and v, crops^2
     measurement: NDArray[np.float64]
-    #: (2,) variance of the velocity before the first frame, (crops / frame)^2
     velocity: NDArray[np.float64]
 
     name = "kalman"
@@ -92,8 +182,7 @@ class KalmanConstantVelocity(Forecaster):
             innovation = history[:, frame] - position
             position += gain_position * innovation
             velocity += gain_velocity * innovation
-        ahead = np.arange(1.0, horizon + 1)[None, :, None, None]
-        return position[:, None] + ahead * velocity[:, None]
+        return position[:, None] + _ahead(horizon) * velocity[:, None]
 
 
 def filter_gains(
@@ -114,12 +203,13 @@ def filter_gains(
 
 def fit_noise(series: NDArray[np.float64]) -> tuple[float, float, float]:
     """(q, r, v) of maximum likelihood for one coordinate in N sequences (N, T)."""
-    still = series[:, :1] == series
-    if np.all(still):
+    if np.all(series[:, :1] == series):
         return _SMALLEST_VARIANCE, _SMALLEST_VARIANCE, _SMALLEST_VARIANCE
 
     def cost(log_ratios: NDArray[np.float64]) -> float:
         return _profile(series, *(10.0**log_ratios))[0]
+
+    from scipy.optimize import minimize  # half a second to import
 
     # where the mouth moves smoothly and the detector trembles, or the other way round
     starts = ([-2.0, 0.0], [0.0, 1.0])
