@@ -19,8 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.sequences import KINDS, SequenceSettings, kind_of
+from face_prediction.dataset.sequences import (
+    KINDS,
+    SequenceSettings,
+    clip_frames,
+    find_sequences,
+    kind_of,
+)
 from face_prediction.evaluation.error_stats import (
     MouthResiduals,
     data_hash,

@@ -84,4 +84,3 @@ class SequenceBatch:
     def future_images(self, size: int) -> NDArray[np.uint8]:
         """Images (B, H, S, S, 3) of the frames to be forecast."""
         return self._future[size]
-

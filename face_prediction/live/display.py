@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from face_prediction.evaluation.video import Colour, draw_dot, draw_line, h264_file
 from face_prediction.forecast import mouth_centre
-from face_prediction.tracking.geometry import Crop
-from face_prediction.tracking.geometry import LIPS
+from face_prediction.tracking.geometry import LIPS, Crop
 from robo_manip_baselines.runs.errors import RequestError
 
 TITLE = "face-prediction live"

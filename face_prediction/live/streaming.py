@@ -134,7 +134,7 @@ class NetworkForecaster:
                 self._tensor(landmarks[-self._network.history :]),
                 torch.cat(features, dim=1),
                 self._tensor(last_image),
-                make_pictures=False,
+                make_images=False,
             ).landmarks
         if ahead is None:
             raise RequestError(

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.models.interface import PredictorModel
 from face_prediction.models.settings import PredictorTrainSettings
+from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.windows import SequenceWindows, WindowBatch
 
 

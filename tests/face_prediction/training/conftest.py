@@ -12,9 +12,13 @@ import pytest
 
 from face_prediction.commands.train import run_train
 from face_prediction.dataset.clip_file import EncodedImages, encode_image, write_clip
-from face_prediction.dataset.manifest import ClipEntry, Manifest, sequence_statistics, write_manifest
-from face_prediction.dataset.sequences import clip_frames, find_sequences
-from face_prediction.dataset.sequences import SequenceSettings
+from face_prediction.dataset.manifest import (
+    ClipEntry,
+    Manifest,
+    sequence_statistics,
+    write_manifest,
+)
+from face_prediction.dataset.sequences import SequenceSettings, clip_frames, find_sequences
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.training import setup as job
 from face_prediction.training import trainer as trainer_module
@@ -25,7 +29,7 @@ SEQUENCES = SequenceSettings(history=8, future=2, stride=4, crop_size=64)
 PEOPLE = {"ann": 0, "bob": 0, "cat": 1, "dan": 2, "eve": 2}
 SETTINGS = (
     "size=32",
-    "channels=[4, 8]",
+    "channels=[8, 8]",
     "width=16",
     "heads=2",
     "layers=1",

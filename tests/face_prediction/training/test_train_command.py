@@ -15,7 +15,6 @@ import torch
 
 from face_prediction.commands.train import run_train
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.evaluation import mouth_distances, mouth_residuals
 from face_prediction.models.checkpoint import read_predictor_checkpoint, read_tensors
 from face_prediction.models.learned import LearnedPredictor
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
