@@ -33,7 +33,7 @@ def test_a_good_track_is_kept_whole_and_unchanged(make_track) -> None:
     np.testing.assert_allclose(motion.mouth, mouth, atol=1e-9)
     np.testing.assert_allclose(motion.jaw, 0.01, atol=1e-9)
     np.testing.assert_allclose(motion.orientation, np.tile([1.0, 0, 0, 0], (200, 1)), atol=1e-9)
-    assert motion.counts == {
+    assert motion.counts() == {
         "frames": 200, "kept": 200, "no_face": 0, "spike": 0, "turned_away": 0, "too_short": 0,
         "out_of_reach": 0, "jumps": 0, "runs": 1,
     }  # fmt: skip
@@ -44,7 +44,7 @@ def test_a_lost_face_splits_and_is_not_bridged(make_track) -> None:
     valid[90] = False
     motion = lift(make_track(sway(200), valid=valid), SHORT)
     assert motion.runs == [(0, 90), (91, 200)]
-    assert motion.counts["no_face"] == 1
+    assert motion.counts()["no_face"] == 1
 
 
 def test_a_jump_splits_and_neither_side_is_smoothed(make_track) -> None:
@@ -53,8 +53,8 @@ def test_a_jump_splits_and_neither_side_is_smoothed(make_track) -> None:
     motion = lift(make_track(mouth), SHORT)
     # the acceleration into and out of the step marks the two frames beside it
     assert motion.runs == [(0, 119), (121, 200)]
-    assert motion.counts["jumps"] == 1
-    assert motion.counts["spike"] == 2
+    assert motion.counts()["jumps"] == 1
+    assert motion.counts()["spike"] == 2
     np.testing.assert_allclose(motion.mouth, mouth, atol=1e-9)
 
 
@@ -63,7 +63,7 @@ def test_what_is_left_over_is_too_short(make_track) -> None:
     valid[170] = False
     motion = lift(make_track(sway(200), valid=valid), SHORT)
     assert motion.runs == [(0, 170)]
-    assert motion.counts["too_short"] == 29
+    assert motion.counts()["too_short"] == 29
 
 
 def test_out_of_reach_is_cut_and_counted(make_track) -> None:
@@ -71,7 +71,7 @@ def test_out_of_reach_is_cut_and_counted(make_track) -> None:
     mouth[130:170, 2] -= 0.2 * np.sin(np.pi * np.arange(40) / 40)  # away by 20 cm and back
     motion = lift(make_track(mouth), SHORT)
     kept = sum(stop - start for start, stop in motion.runs)
-    assert 0 < motion.counts["out_of_reach"] == 300 - kept
+    assert 0 < motion.counts()["out_of_reach"] == 300 - kept
     for start, stop in motion.runs:
         for first in range(start, stop - 30):
             assert np.abs(mouth[first : first + 31] - mouth[first]).max() <= 0.08 + 1e-9
@@ -86,7 +86,7 @@ def test_counts_add_up_and_runs_hold_only_good_frames(make_track, seed: int) -> 
     mouth[:, 2] = np.minimum(mouth[:, 2], -0.1)
     valid = random.random(frames) > random.choice([0.0, 0.02])
     motion = lift(make_track(mouth, valid=valid), SHORT)
-    counts = motion.counts
+    counts = motion.counts()
     causes = ("kept", "no_face", "spike", "turned_away", "too_short", "out_of_reach")
     assert sum(counts[cause] for cause in causes) == counts["frames"] == frames
     good = motion.quality.found & ~motion.quality.spike & ~motion.quality.turned_away

@@ -15,10 +15,14 @@ from face_prediction.dataset.clip_file import EncodedImages, encode_image, write
 from face_prediction.dataset.manifest import (
     ClipEntry,
     Manifest,
-    sequence_statistics,
     write_manifest,
 )
-from face_prediction.dataset.sequences import SequenceSettings, clip_frames, find_sequences
+from face_prediction.dataset.sequences import (
+    SequenceSettings,
+    clip_frames,
+    find_sequences,
+    sequence_statistics,
+)
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.training import setup as job
 from face_prediction.training import trainer as trainer_module
