@@ -217,9 +217,7 @@ class PolicyRunner:
         # Those of a step enter the next prediction if its window of O steps reaches back to them.
         return self._buffer.steps_to_prediction(env_ids) < self._states.shape[1]
 
-    def act(
-        self, observations: Mapping[str, NDArray[Any]], env_ids: EnvIds
-    ) -> NDArray[np.float32]:
+    def act(self, observations: Mapping[str, NDArray[Any]], env_ids: EnvIds) -> NDArray[np.float32]:
         """Return the next actions (b, A) in the units of the environment.
 
         Args:

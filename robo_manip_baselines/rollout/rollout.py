@@ -21,16 +21,16 @@ from robo_manip_baselines.rollout.workers import Environments, Order, split_vect
 class Policy(Protocol):
     """What acts. Slots are numbers of episodes that run at once, none of them twice in a call."""
 
-    def reset(self, slots: NDArray[np.intp]) -> None:
-        """Start episodes in these slots."""
+    def reset(self, env_ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
+        """Start episodes of these seeds in these environments."""
         ...
 
-    def looks(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Say, (b,), which slots will look at their cameras when they act next."""
+    def needs_images(self, env_ids: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return (b,) whether the images of each environment's next observation are needed."""
         ...
 
     def act(
-        self, observations: Mapping[str, NDArray[Any]], slots: NDArray[np.intp]
+        self, observations: Mapping[str, NDArray[Any]], env_ids: NDArray[np.intp]
     ) -> NDArray[np.float32]:
         """Return the next actions (b, A), each from its own row of observations (b, ...) alone."""
         ...
@@ -86,12 +86,11 @@ def rollout(
         if not used:
             return []
         numbers = np.array(used, dtype=np.intp)
-        policy.reset(numbers)
+        begun = [waiting.popleft() for _ in used]
+        policy.reset(numbers, begun)
         recordings.update((slot, Recording()) for slot in used)
-        looks = policy.looks(numbers).tolist()
-        return [
-            Order(slot, waiting.popleft(), look) for slot, look in zip(used, looks, strict=True)
-        ]
+        looks = policy.needs_images(numbers).tolist()
+        return [Order(*order) for order in zip(used, begun, looks, strict=True)]
 
     def act(slots: list[int]) -> list[Order]:
         """Let the policy act in these slots."""
@@ -107,7 +106,7 @@ def rollout(
         for slot, vector, action in zip(slots, vectors, actions, strict=True):
             recordings[slot].vectors.append(vector)
             recordings[slot].actions.append(action)
-        looks = policy.looks(numbers).tolist()
+        looks = policy.needs_images(numbers).tolist()
         return [Order(slot, None, look) for slot, look in zip(slots, looks, strict=True)]
 
     orders, running = start(range(arrays.slots)), 0

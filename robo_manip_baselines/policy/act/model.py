@@ -1,8 +1,8 @@
 """The network of ACT: action chunking with Transformers (Zhao et al. 2023).
 
-Legend: B batch, L tokens that ask, M tokens of the memory, D hidden size, G attention heads, E width
-of a head, K actions of a chunk, S elements of the state, A elements of an action, N cameras, H and
-W image height and width, h and w those of a feature map, Z latent size.
+Legend: B batch, L query tokens, M tokens of the memory, D hidden size, G attention heads, E size of
+a head, K actions of a chunk, S elements of the state, A elements of an action, N cameras, H and W
+image height and width, h and w those of a feature map, Z latent size.
 """
 
 from __future__ import annotations
@@ -212,11 +212,11 @@ class EncoderLayer(nn.Module):
 
     def forward(self, x_BLD: Tensor, position_LD: Tensor, keep_BL: Tensor | None) -> Tensor:
         """Return (B, L, D)."""
-        block_input = self.attention_residual.before(x_BLD)
-        query = block_input + position_LD
-        x_BLD = self.attention_residual.after(x_BLD, self.attention(query, query, block_input, keep_BL))
-        block_input = self.feed_forward_residual.before(x_BLD)
-        return self.feed_forward_residual.after(x_BLD, self.feed_forward(block_input))
+        inner = self.attention_residual.before(x_BLD)
+        query = inner + position_LD
+        x_BLD = self.attention_residual.after(x_BLD, self.attention(query, query, inner, keep_BL))
+        inner = self.feed_forward_residual.before(x_BLD)
+        return self.feed_forward_residual.after(x_BLD, self.feed_forward(inner))
 
 
 class Encoder(nn.Module):
@@ -257,14 +257,14 @@ class DecoderLayer(nn.Module):
         self, x_BLD: Tensor, position_LD: Tensor, memory_BMD: Tensor, memory_key_BMD: Tensor
     ) -> Tensor:
         """Return (B, L, D)."""
-        block_input = self.attention_residual.before(x_BLD)
-        query = block_input + position_LD
-        x_BLD = self.attention_residual.after(x_BLD, self.attention(query, query, block_input))
+        inner = self.attention_residual.before(x_BLD)
+        query = inner + position_LD
+        x_BLD = self.attention_residual.after(x_BLD, self.attention(query, query, inner))
         query = self.memory_residual.before(x_BLD) + position_LD
         found = self.memory_attention(query, memory_key_BMD, memory_BMD)
         x_BLD = self.memory_residual.after(x_BLD, found)
-        block_input = self.feed_forward_residual.before(x_BLD)
-        return self.feed_forward_residual.after(x_BLD, self.feed_forward(block_input))
+        inner = self.feed_forward_residual.before(x_BLD)
+        return self.feed_forward_residual.after(x_BLD, self.feed_forward(inner))
 
 
 class Decoder(nn.Module):

@@ -83,7 +83,8 @@ class BasicBlock(nn.Module):
         self.downsample: nn.Sequential | None = None
         if stride != 1 or channels_in != channels_out:
             self.downsample = nn.Sequential(
-                nn.Conv2d(channels_in, channels_out, 1, stride, bias=False), FrozenBatchNorm(channels_out)
+                nn.Conv2d(channels_in, channels_out, 1, stride, bias=False),
+                FrozenBatchNorm(channels_out),
             )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -117,7 +118,9 @@ class ResNet18(nn.Module):
         channels_in = WIDTHS[0]
         for stage, channels_out in enumerate(WIDTHS, start=1):
             blocks = [BasicBlock(channels_in, channels_out, 1 if stage == 1 else 2)]
-            blocks += [BasicBlock(channels_out, channels_out, 1) for _ in range(BLOCKS_PER_STAGE - 1)]
+            blocks += [
+                BasicBlock(channels_out, channels_out, 1) for _ in range(BLOCKS_PER_STAGE - 1)
+            ]
             self.add_module(f"layer{stage}", nn.Sequential(*blocks))
             channels_in = channels_out
         self.features = channels_in
