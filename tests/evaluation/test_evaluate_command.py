@@ -149,7 +149,7 @@ def children_of_group(group: int) -> list[int]:
         ("--checkpoint nowhere", "checkpoint 'nowhere' does not exist"),
         ("--temporal_ensemble --execute 2", "--temporal_ensemble and --execute: say one"),
         ("--execute 0", "(--execute) 0"),
-        ("--execute 7", r"\(--execute\) 7: must be 1 to 6"),
+        ("--execute 7", "(--execute) 7: must be 1 to 6"),
         ("--num_envs 0", "num_envs 0"),
         ("--workers -1", "workers -1"),
         ("--video -1", "video -1"),
