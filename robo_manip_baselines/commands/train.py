@@ -12,12 +12,7 @@ from typing import Any, Generic
 
 import tyro
 
-from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.spec import (
-    CorruptionOptions,
-    parse_cameras,
-    parse_image_size,
-)
+from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.registry import policy_names, policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.command import parse
@@ -39,59 +34,16 @@ EXAMPLE = "python bin/Train.py Act --obs current_pred --horizon 2 --seed 0"
 
 
 @dataclass(frozen=True)
-class ObservationOptions:
-    """Observations of the policy."""
-
-    obs: str = "current_pred"
-    """Preset: baseline (the robot), current (mouth too), current_pred (its future too)."""
-    horizon: int = 2
-    """Frames of 1/30 s that current_pred looks ahead, 1 to 5."""
-    cameras: tuple[str, ...] = ()
-    """Cameras, or none."""
-    image_size: str = "480x640"
-    """Height x width to which images are scaled, in pixels."""
-    object_pose: bool = False
-    """Observe the cube's position."""
-    arms: str = "right"
-    """Arms that the demonstrations move: right or both."""
-
-
-@dataclass(frozen=True)
 class TrainOptions(Generic[Network]):
     """Train a policy on demonstrations."""
 
     run: tyro.conf.OmitArgPrefixes[TrainConfig[Network]]
-    observation: tyro.conf.OmitArgPrefixes[ObservationOptions]
-    corruption: tyro.conf.OmitArgPrefixes[CorruptionOptions]
-    """Corruption of the observed mouth."""
+    corruption: bool = True
+    """--no_corruption turns all corruption of the observations off."""
     resume: bool = False
     """Continue the run in the run folder."""
     config: Path | None = None
     """YAML file of options, such as the config.yaml of a run; the command line overrides it."""
-
-    @classmethod
-    def from_config(cls, config: TrainConfig[Any]) -> TrainOptions[Any]:
-        """Return options whose values are those of a configuration."""
-        spec = config.spec
-        values = {
-            item.name: getattr(spec, item.name) for item in dataclasses.fields(ObservationOptions)
-        }
-        values["cameras"] = spec.cameras or ("none",)
-        values["image_size"] = f"{spec.image_size[0]}x{spec.image_size[1]}"
-        return cls(config, ObservationOptions(**values), CorruptionOptions())
-
-    def to_config(self, preset: str) -> TrainConfig[Any]:
-        """Return the configuration.
-
-        Raises:
-            RequestError: a value that is not valid.
-        """
-        values = vars(self.observation) | {
-            "cameras": parse_cameras(self.observation.cameras),
-            "image_size": parse_image_size(self.observation.image_size),
-        }
-        spec = ObservationSpec(**values, corruption=self.corruption.apply())
-        return dataclasses.replace(self.run, spec=spec, preset=preset)
 
 
 def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfig[Any]:
@@ -117,7 +69,7 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     preset = _last_value(args, "preset") or str(values.get("preset", "auto"))
     if preset == "auto":
         preset = _auto_preset(list(presets), False if is_help else has_gpu, is_quiet=is_help)
-    options = TrainOptions.from_config(TrainConfig.from_preset(policy, preset))
+    options = TrainOptions(TrainConfig.from_preset(policy, preset))
     options = _with_budget(options, values)
     if file:
         options = _apply_yaml(file, {**values, "preset": preset}, options)
@@ -128,7 +80,13 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
         f"defaults below are those of {policy} with --preset {preset}. Presets of {policy}: "
         f"{', '.join(presets)}."
     )
-    return _parse(options, list(args), description).to_config(preset)
+    options = _parse(options, list(args), description)
+    config = dataclasses.replace(options.run, preset=preset)
+    if options.corruption:
+        return config
+    return dataclasses.replace(
+        config, spec=dataclasses.replace(config.spec, corruption=Corruption())
+    )
 
 
 def _parse(options: TrainOptions[Any], args: list[str], description: str) -> TrainOptions[Any]:

@@ -1,6 +1,7 @@
-"""The truth that an episode file holds, ready for `observe`.
+"""Demonstrations: a folder of episodes as a policy sees it, split into training and validation.
 
-Legend: T control steps, A arms (left before right), K = 6 frames from now to the longest horizon.
+Legend: E episodes, T control steps of an episode, A arms (left before right) or elements of an
+action, S elements of the packed observation.
 """
 
 from __future__ import annotations
@@ -19,32 +20,32 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.data.episode import EpisodeReader, read_metadata
 from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_episodes, seed_of
-from robo_manip_baselines.observation import ObservationSpec, observe
-from robo_manip_baselines.observation.detector import NO_PREDICTION, Detector
-from robo_manip_baselines.observation.state import Truth, to_vector
+from robo_manip_baselines.data.schema import POLICY_ATTRIBUTES
+from robo_manip_baselines.observation import ObservationSpec, State
+from robo_manip_baselines.observation.corruption import NO_PREDICTION
 from robo_manip_baselines.runs.errors import RequestError
 
 
-def recorded_truth(episode: EpisodeReader) -> Truth:
-    """Read the (T, ...) truth of an episode of one arm or of both.
+def recorded_state(episode: EpisodeReader) -> State:
+    """Read the (T, ...) state of an episode of one arm or of both.
 
     Raises:
         EpisodeFileError: a field is missing or damaged.
     """
-    gripper_position = episode.array("gripper_position")
+    task, gripper_position = episode.task, episode.array("gripper_position")
     arms = gripper_position.shape[1]
-
-    return Truth(
+    objects = [episode.array(name)[:, None, :3] for name in task.object_fields]
+    return State(
         time=episode.array("time"),
         joint_position=episode.array("joint_position").reshape(len(episode), arms, -1),
         joint_velocity=episode.array("joint_velocity").reshape(len(episode), arms, -1),
         gripper_position=gripper_position,
         gripper_velocity=episode.array("gripper_velocity"),
         end_effector_position=episode.array("end_effector_position"),
-        mouth_position=episode.array("mouth_position"),
-        object_position=episode.array("object_pose")[:, :3],
-        predicted_mouth=(
-            episode.array("predicted_mouth") if "predicted_mouth" in episode.fields else None
+        target_position=episode.array(task.target_field),
+        object_position=np.concatenate([np.empty((len(episode), 0, 3)), *objects], axis=1),
+        predicted_target=(
+            episode.array(task.predicted_field) if task.predicted_field in episode.fields else None
         ),
     )
 
@@ -117,16 +118,6 @@ def split_episodes(seeds: Iterable[int], fraction: float, seed: int) -> Split:
     return Split(tuple(sorted(shuffled[held_out:])), tuple(sorted(shuffled[:held_out])))
 
 
-SHARED = (
-    "env_id",
-    "xml_hash",
-    "control_period",
-    "prediction_period",
-    "action_names",
-    "joint_names",
-)
-"""Attributes that episodes must share for one policy to learn from them."""
-
 _SHOWN = {field.name for field in fields(ObservationSpec)} | {"error"}
 """Arguments of an environment that say what it shows (``error``: in older files); files hold truth,
 whatever was shown."""
@@ -188,7 +179,7 @@ class Demonstrations:
 
 
 def load_demonstrations(
-    folder: Path, spec: ObservationSpec, *, limit: int | None = None
+    folder: Path, spec: ObservationSpec, *, limit: int | None = None, env: str | None = None
 ) -> Demonstrations:
     """Read the vectors and actions of a folder's episodes; images stay in the files.
 
@@ -198,6 +189,7 @@ def load_demonstrations(
             each episode. An ``image_size`` smaller than the recorded one is met by shrinking images
             as they are read; a larger one is refused, for it would add nothing.
         limit: read only so many episodes, those of the lowest seeds; all of them if None.
+        env: name of the task, for error messages; the folder's name if None.
 
     Raises:
         RequestError: no such folder, no or not enough episodes in it, episodes that do not belong
@@ -207,9 +199,9 @@ def load_demonstrations(
     """
     folder = Path(folder)
     # With the digest of the statistics, so that a policy is evaluated with those it learnt from.
-    spec = replace(spec, corruption=spec.corruption and spec.corruption.pinned())
-    detector = Detector.of(spec)
-    paths = _episode_paths(folder, spec, limit)
+    spec = replace(spec, corruption=spec.corruption.pinned())
+    pipeline = spec.make_pipeline()
+    paths = _episode_paths(env or folder.name, folder, spec, limit)
     states: list[NDArray[np.float32]] = []
     actions: list[NDArray[np.float32]] = []
     attributes: list[dict[str, Any]] = []
@@ -217,11 +209,11 @@ def load_demonstrations(
         with EpisodeReader(path) as episode:
             attributes.append(episode.attributes)
             _require_same(paths[0], attributes[0], path, attributes[-1])
-            _require_spec(path, attributes[-1], spec)
-            truth, report = recorded_truth(episode), None
-            if detector:
-                report = detector.report_episode(truth, attributes[-1]["seed"])
-            states.append(to_vector(spec, observe(spec, truth, report)))
+            _require_spec(episode, spec)
+            state, target = recorded_state(episode), None
+            if pipeline:
+                target = pipeline.observe_episode(state, attributes[-1]["seed"])
+            states.append(spec.pack(state, target))
             actions.append(episode.array("action").astype(np.float32))
     lengths = np.array([len(action) for action in actions], dtype=np.int64)
     hashes = "\n".join(item["content_sha256"] for item in attributes)
@@ -243,23 +235,23 @@ def load_demonstrations(
     )
 
 
-def recording_command(folder: Path, spec: ObservationSpec, num_episodes: int = 50) -> str:
-    """Return the line that records demonstrations of the feeding task for ``spec``."""
+def recording_command(env: str, folder: Path, spec: ObservationSpec, num_episodes: int = 50) -> str:
+    """Return the command that records demonstrations of a task for ``spec``."""
     out = shlex.quote(str(folder))
-    line = f"python bin/Rollout.py FeedingEnv --scripted --num_episodes {num_episodes} --out {out}"
+    line = f"python bin/Rollout.py {env} --scripted --num_episodes {num_episodes} --out {out}"
     if not spec.cameras:
         return f"{line} --cameras none"
     height, width = spec.image_size
     return line if (height, width) == (480, 640) else f"{line} --image_size {height}x{width}"
 
 
-def _episode_paths(folder: Path, spec: ObservationSpec, limit: int | None) -> list[Path]:
+def _episode_paths(env: str, folder: Path, spec: ObservationSpec, limit: int | None) -> list[Path]:
     if limit is not None and limit < 1:
         raise RequestError(f"{limit} episodes: must be 1 or more")
     paths = list_episodes(folder) if folder.is_dir() else []
     if not paths:
         what = "holds no episode_*.hdf5 file" if folder.is_dir() else "is no folder"
-        raise RequestError(f"'{folder}' {what}; record it: {recording_command(folder, spec)}")
+        raise RequestError(f"'{folder}' {what}; record it: {recording_command(env, folder, spec)}")
     if limit is not None and limit > len(paths):
         recorded = read_metadata(paths[0])
         same = replace(
@@ -269,7 +261,7 @@ def _episode_paths(folder: Path, spec: ObservationSpec, limit: int | None) -> li
         )
         # Failures count among the seeds that are done, so that more of them are needed.
         seeds = max(finished_seeds(folder)) + 1 + limit - len(paths)
-        line = recording_command(folder, same, seeds)
+        line = recording_command(env, folder, same, seeds)
         raise RequestError(
             f"'{folder}' holds {len(paths)} episodes, not {limit}; ask for fewer, or record: {line}"
         )
@@ -280,8 +272,8 @@ def _require_same(
     first: Path, expected: Mapping[str, Any], path: Path, given: Mapping[str, Any]
 ) -> None:
     """Raise RequestError if two files are not of one kind."""
-    ours = {**{name: expected[name] for name in SHARED}, "env_kwargs": _world(expected)}
-    theirs = {**{name: given[name] for name in SHARED}, "env_kwargs": _world(given)}
+    ours = {**{name: expected[name] for name in POLICY_ATTRIBUTES}, "env_kwargs": _world(expected)}
+    theirs = {**{name: given[name] for name in POLICY_ATTRIBUTES}, "env_kwargs": _world(given)}
     for name, value in ours.items():
         if theirs[name] != value:
             raise RequestError(
@@ -290,8 +282,9 @@ def _require_same(
             )
 
 
-def _require_spec(path: Path, attributes: Mapping[str, Any], spec: ObservationSpec) -> None:
-    """Raise RequestError if a file is no demonstration of what is to be observed."""
+def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:
+    """Raise RequestError if an episode is no demonstration of what is to be observed."""
+    path, attributes = episode.path, episode.attributes
     if attributes["seed"] != seed_of(path):
         raise RequestError(f"'{path}' holds seed {attributes['seed']}: give it its name back")
     if not attributes["is_success"]:
@@ -302,12 +295,17 @@ def _require_spec(path: Path, attributes: Mapping[str, Any], spec: ObservationSp
             f"'{path}' was recorded with the arms {', '.join(arms)}; arms '{spec.arms}' needs "
             f"{', '.join(spec.arm_names)}"
         )
-    if spec.corruption and spec.corruption.error == "model" and attributes["schema_version"] < 2:
+    if spec.object_pose and not episode.task.names.objects:
+        raise RequestError(f"object_pose: {episode.task.name} has no objects; leave it out")
+    has_prediction = episode.task.predicted_field in episode.fields
+    if spec.corruption.error == "model" and not has_prediction:
         raise RequestError(f"'{path}' holds {NO_PREDICTION}")
     recorded = attributes["cameras"]
     there = ", ".join(recorded) or "none"
     # Beside, for episodes with other images do not belong into the same folder.
-    line = recording_command(path.parent.with_name(f"{path.parent.name}_images"), spec)
+    line = recording_command(
+        episode.task.name, path.parent.with_name(f"{path.parent.name}_images"), spec
+    )
     missing = [camera for camera in spec.cameras if camera not in recorded]
     if missing:
         raise RequestError(

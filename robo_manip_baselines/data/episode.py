@@ -1,4 +1,7 @@
-"""Pictures to bytes and back: JPEG, PNG or raw. Images are RGB, (H, W, 3) uint8."""
+"""Episode files: one HDF5 file an episode, read lazily, written atomically.
+
+Images are RGB, (H, W, 3) uint8, and stored as JPEG, PNG or raw.
+"""
 
 from __future__ import annotations
 
@@ -14,22 +17,19 @@ import h5py
 import numpy as np
 
 from robo_manip_baselines.data.schema import (
-    ATTRIBUTES,
-    FIELD_BY_NAME,
-    FIELDS,
     IMAGE_GROUP,
     READABLE_VERSIONS,
     SCHEMA,
+    EpisodeSchema,
     content_digest,
     episode_consistency,
-    fields_of,
     loaded_attribute,
     shape_problems,
     stored_attribute,
     stored_text,
     value_problems,
-    version_of,
 )
+from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, entry_of_id
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import atomic_file
 
@@ -44,7 +44,7 @@ DEFAULT_QUALITY = 90
 def encode_image(
     image: np.ndarray, codec: str = "jpeg", quality: int = DEFAULT_QUALITY
 ) -> np.ndarray:
-    """Encode one picture.
+    """Encode one image.
 
     Args:
         image: (H, W, 3) uint8, RGB.
@@ -89,21 +89,21 @@ def decode_image(data: np.ndarray) -> np.ndarray:
         (H, W, 3) uint8, RGB.
 
     Raises:
-        ValueError: if the bytes are no picture.
+        ValueError: the bytes are no image.
     """
     if data.ndim == 3:
         return data
     try:
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     except cv2.error as error:
-        raise ValueError(f"no picture: {str(error).strip()}") from error
+        raise ValueError(f"no image: {str(error).strip()}") from error
     if bgr is None:
-        raise ValueError("no picture")
+        raise ValueError("no image")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
 def image_checksum(data: np.ndarray) -> int:
-    """CRC-32 of an encoded picture, as kept beside it in the episode file."""
+    """CRC-32 of an encoded image, as kept beside it in the episode file."""
     return zlib.crc32(np.ascontiguousarray(data).reshape(-1).data)
 
 
@@ -133,6 +133,8 @@ class EpisodeReader:
 
     Attributes:
         path: the file.
+        task: entry of the task that was recorded.
+        schema: of its files.
         attributes: name -> value, JSON parsed, vectors as float64 arrays.
 
     Raises:
@@ -145,13 +147,15 @@ class EpisodeReader:
         self._file = open_hdf5(self.path)
         try:
             require_schema(self.path, self._file)
+            self.task = task_of(self._file)
+            self.schema = EpisodeSchema.of(self.task)
             self.attributes = {
                 item.name: loaded_attribute(item, self._file.attrs[item.name])
-                for item in ATTRIBUTES
+                for item in self.schema.attributes
             }
         except READ_ERRORS as error:
             self._file.close()
-            if isinstance(error, EpisodeFileError):
+            if isinstance(error, RequestError):
                 raise
             raise EpisodeFileError(f"'{self.path}' is damaged: {one_line(error)}") from error
 
@@ -176,8 +180,8 @@ class EpisodeReader:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Names of the fields of the table that a file of its schema version holds."""
-        return fields_of(self.attributes["schema_version"])
+        """Names of the fields that the file holds."""
+        return self.schema.fields_of(self.attributes["schema_version"], self._file)
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
@@ -191,7 +195,7 @@ class EpisodeReader:
             RequestError: for an unknown name.
             EpisodeFileError: if it is missing or damaged.
         """
-        require_choice("field", name, FIELD_BY_NAME)
+        require_choice("field", name, self.schema.by_name)
         try:
             return np.asarray(dataset_of(self._file, name)[()])
         except READ_ERRORS as error:
@@ -200,7 +204,7 @@ class EpisodeReader:
             ) from error
 
     def encoded_frame(self, camera: str, step: int) -> np.ndarray:
-        """The bytes of one picture, (N,) uint8; with the codec ``raw`` the (H, W, 3) image.
+        """The bytes of one image, (N,) uint8; with the codec ``raw`` the (H, W, 3) image.
 
         Raises:
             RequestError: for a camera or step that the episode does not have.
@@ -219,7 +223,7 @@ class EpisodeReader:
             ) from error
 
     def frame(self, camera: str, step: int) -> np.ndarray:
-        """One picture, (H, W, 3) uint8 RGB. Raises as `encoded_frame` does."""
+        """One image, (H, W, 3) uint8 RGB. Raises as `encoded_frame` does."""
         data = self.encoded_frame(camera, step)
         try:
             return decode_image(data)
@@ -234,7 +238,7 @@ class EpisodeReader:
 
 
 class FrameStore:
-    """The encoded pictures of one camera in an open file.
+    """The encoded images of one camera in an open file.
 
     Raises:
         KeyError, ValueError, OSError: see `READ_ERRORS`; if something is missing or damaged.
@@ -252,7 +256,7 @@ class FrameStore:
             raise ValueError(f"{frames} frames instead of {num_steps}")
 
     def encoded(self, step: int) -> np.ndarray:
-        """One picture as it was given to the writer; raises if it is not that any more."""
+        """One image as it was given to the writer; raises if it is not that any more."""
         if self._offset is None:
             data = np.asarray(self._data[step])
         else:
@@ -293,6 +297,17 @@ def require_schema(path: Path, file: h5py.File) -> None:
         )
 
 
+def task_of(file: h5py.File) -> TaskEntry:
+    """Return the entry of the task that an episode file is of.
+
+    Raises:
+        KeyError, ValueError: the attribute ``env_id`` is missing or damaged.
+        RequestError: no task of that id is registered here.
+    """
+    item = EpisodeSchema.of(None).attribute_by_name["env_id"]
+    return entry_of_id(loaded_attribute(item, file.attrs[item.name]))
+
+
 def dataset_of(file: h5py.File, name: str) -> h5py.Dataset:
     """The dataset of that name; raises KeyError if there is none."""
     dataset = file.get(name)
@@ -312,7 +327,7 @@ def one_line(error: BaseException) -> str:
 # From this release of the file format on, HDF5 keeps checksums of its own structure.
 _HDF5_FORMAT = ("v110", "v110")
 
-# Of pictures one after another: about one JPEG of 480 x 640, so that one frame reads one or two.
+# Of images one after another: about one JPEG of 480 x 640, so that one frame reads one or two.
 _CHUNK_BYTES = 65536
 
 EncodedImages = Mapping[str, Sequence[np.ndarray]]
@@ -330,11 +345,11 @@ def write_episode(
 
     Args:
         path: file to write, see `files.episode_path`. Replaced if it is there.
-        arrays: every field of `schema.FIELDS`, those that are not in every schema version
-            where they are known; float32 is widened.
+        arrays: every field of the task's schema, optional ones where they are known; float32 is
+            widened.
         images: camera -> T frames, each from `images.encode_image` with the codec that
             ``attributes["image_codec"]`` names. Empty without cameras.
-        attributes: every attribute of `schema.ATTRIBUTES` that is not derived.
+        attributes: every attribute of the schema that is not derived.
 
     Returns:
         ``path``.
@@ -344,28 +359,29 @@ def write_episode(
         OSError: if the file cannot be written.
     """
     path = Path(path)
-    fields = _checked_arrays(arrays)
+    schema = EpisodeSchema.of(entry_of_id(attributes["env_id"]))
+    fields = _checked_arrays(schema, arrays)
     checksums = {
         camera: np.array([image_checksum(frame) for frame in frames], dtype=np.uint32)
         for camera, frames in sorted(images.items())
     }
     stored, loaded = _checked_attributes(
-        attributes, images, len(fields["time"]), version_of(fields)
+        schema, attributes, images, len(fields["time"]), schema.version_of(fields)
     )
     problems = episode_consistency(loaded, fields)
     problems += value_problems(
-        FIELD_BY_NAME["phase"], np.asarray(arrays["phase"]), len(loaded["phase_names"])
+        schema.by_name["phase"], np.asarray(arrays["phase"]), len(loaded["phase_names"])
     )
     if problems:
         raise ValueError(f"episode for '{path}': {'; '.join(problems)}")
-    stored["content_sha256"] = stored_text(content_digest(fields, checksums, loaded))
+    stored["content_sha256"] = stored_text(content_digest(schema, fields, checksums, loaded))
     with (
         atomic_file(path) as temporary,
         h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file,
     ):
-        for item in ATTRIBUTES:
+        for item in schema.attributes:
             file.attrs[item.name] = stored[item.name]
-        for field in FIELDS:
+        for field in schema.fields:
             if field.name not in fields:
                 continue
             _write_array(file, field.name, fields[field.name])
@@ -377,12 +393,14 @@ def write_episode(
     return path
 
 
-def _checked_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _checked_arrays(
+    schema: EpisodeSchema, arrays: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
     values = {name: np.asarray(array) for name, array in arrays.items()}
-    problems = [f"'{name}' is missing" for name in fields_of(1) if name not in values]
-    problems += [f"'{name}' is no field" for name in values if name not in FIELD_BY_NAME]
-    problems += shape_problems({name: value.shape for name, value in values.items()})
-    for field in FIELDS:
+    problems = [f"'{name}' is missing" for name in schema.fields_of(3) if name not in values]
+    problems += [f"'{name}' is no field" for name in values if name not in schema.by_name]
+    problems += shape_problems(schema, {name: value.shape for name, value in values.items()})
+    for field in schema.fields:
         if field.name in values and not np.can_cast(
             values[field.name].dtype, field.dtype, "same_kind"
         ):
@@ -390,17 +408,21 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             problems.append(f"'{field.name}' is {given}, not {field.dtype}")
     if not problems:
         for name, value in values.items():
-            problems += value_problems(FIELD_BY_NAME[name], value, None)
+            problems += value_problems(schema.by_name[name], value, None)
     if problems:
         raise ValueError(f"these arrays are no episode: {'; '.join(problems)}")
-    return {name: value.astype(FIELD_BY_NAME[name].dtype) for name, value in values.items()}
+    return {name: value.astype(schema.by_name[name].dtype) for name, value in values.items()}
 
 
 def _checked_attributes(
-    attributes: Mapping[str, Any], images: EncodedImages, num_steps: int, version: int
+    schema: EpisodeSchema,
+    attributes: Mapping[str, Any],
+    images: EncodedImages,
+    num_steps: int,
+    version: int,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Both forms of all attributes: as HDF5 keeps them, and as they are read back."""
-    given = {item.name for item in ATTRIBUTES if not item.derived}
+    given = {item.name for item in schema.attributes if not item.is_derived}
     problems = [f"attribute '{name}' is missing" for name in sorted(given - set(attributes))]
     problems += [f"attribute '{name}' is not for the caller" for name in set(attributes) - given]
     if problems:
@@ -415,8 +437,8 @@ def _checked_attributes(
         "cameras": sorted(images),
         "image_size": _image_size(images, codec, num_steps),
     }
-    stored = {item.name: stored_attribute(item, values[item.name]) for item in ATTRIBUTES}
-    loaded = {item.name: loaded_attribute(item, stored[item.name]) for item in ATTRIBUTES}
+    stored = {item.name: stored_attribute(item, values[item.name]) for item in schema.attributes}
+    loaded = {item.name: loaded_attribute(item, stored[item.name]) for item in schema.attributes}
     return stored, loaded
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from robo_manip_baselines.data.episode import encode_image
-from robo_manip_baselines.data.schema import FIELDS, fields_of
+from robo_manip_baselines.data.schema import EpisodeSchema
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 
 
 def make_arrays(
@@ -21,11 +22,12 @@ def make_arrays(
         arms: 1 or 2.
         version: of the schema.
     """
+    schema = EpisodeSchema.of(task_entry("FeedingEnv"))
     rng = np.random.default_rng(seed)
     sizes = {"T": steps, "A": 7 * arms, "J": 6 * arms, "G": arms, "Q": 23, "V": 22}
     arrays: dict[str, np.ndarray] = {}
     # By version, so that the numbers of the older fields are those of an older file.
-    for field in sorted(FIELDS, key=lambda field: field.since):
+    for field in sorted(schema.fields, key=lambda field: field.since):
         shape = tuple(sizes[size] if isinstance(size, str) else size for size in field.shape)
         values = rng.normal(size=shape)
         if field.rule == "unit quaternion":
@@ -39,7 +41,7 @@ def make_arrays(
         if field.dtype == "bool":
             values = values > 0
         arrays[field.name] = values.astype(field.dtype)
-    return {name: arrays[name] for name in fields_of(version)}
+    return {name: arrays[name] for name in schema.fields_of(version)}
 
 
 def make_frames(steps: int = 12, seed: int = 0, size: tuple[int, int] = (24, 32)) -> np.ndarray:

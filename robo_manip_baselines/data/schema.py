@@ -1,4 +1,4 @@
-"""What an episode file holds: the one table that writer, reader, verifier and docs are made from.
+"""Schema of episode files: the one table that writer, reader, verifier and docs are made from.
 
 Shape symbols: T control steps, A actions, J arm joints, G grippers, Q positions and V velocities
 of the simulator's state. One arm has A=7, J=6, G=1; two arms have A=14, J=12, G=2, left before
@@ -12,24 +12,38 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cache, cached_property
+from typing import Any
 
 import h5py
 import numpy as np
 
-SCHEMA = "robo_manip_baselines/episode"
-SCHEMA_VERSION = 2
-READABLE_VERSIONS = (1, 2)
-"""A file says the lowest that describes it, so that one without newer fields stays the same."""
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    Attribute,
+    Field,
+    TaskEntry,
+)
 
-# A group for each camera: `data`, the pictures one after another; `offset` (T + 1,), where each
+SCHEMA = "robo_manip_baselines/episode"
+SCHEMA_VERSION = 3
+READABLE_VERSIONS = (1, 2, 3)
+"""A file has the lowest version that describes it: 2 added ``predicted_mouth``, 3 other tasks than
+feeding, whose fields and attributes are those of the task that ``env_id`` names."""
+
+# A group for each camera: `data`, the images one after another; `offset` (T + 1,), where each
 # begins; `checksum` (T,), the CRC-32 of each. HDF5's own type for rows of varying length is not
 # used: it has no checksum, and a changed byte in it can make the library loop for ever.
 IMAGE_GROUP = "images"
 
-Size = int | str
-AttributeKind = Literal["text", "json", "int", "float", "bool", "vector"]
-Rule = Literal["", "unit quaternion", "increasing", "not negative", "phase index"]
+POLICY_ATTRIBUTES = (
+    "env_id",
+    "xml_hash",
+    "control_period",
+    "prediction_period",
+    "action_names",
+    "joint_names",
+)
+"""Attributes that episodes must share for one policy to learn from them."""
 
 SYMBOLS: Mapping[str, str] = {
     "T": "control steps of the episode",
@@ -42,32 +56,7 @@ SYMBOLS: Mapping[str, str] = {
 ALLOWED_SIZES: Mapping[str, tuple[int, ...]] = {"A": (7, 14), "J": (6, 12), "G": (1, 2)}
 
 
-@dataclass(frozen=True)
-class Field:
-    """One array of an episode, a row for each control step."""
-
-    name: str
-    shape: tuple[Size, ...]
-    dtype: str
-    unit: str
-    frame: str
-    description: str
-    rule: Rule = ""
-    since: int = 1  # schema version; not in files of a lower one
-
-
-@dataclass(frozen=True)
-class Attribute:
-    """One attribute of the file's root group; ``derived`` ones are filled in by the writer."""
-
-    name: str
-    kind: AttributeKind
-    description: str
-    derived: bool = False
-    length: int = 0  # of a vector
-
-
-FIELDS: tuple[Field, ...] = (
+_STATE_FIELDS = (
     Field("time", ("T",), "float64", "s", "", "Simulated time since reset", "increasing"),
     Field(
         "action",
@@ -99,51 +88,10 @@ FIELDS: tuple[Field, ...] = (
         "Right gripper site: quaternion w, x, y, z",
         "unit quaternion",
     ),
-    Field(
-        "mouth_position",
-        ("T", 6, 3),
-        "float64",
-        "m",
-        "world",
-        "True mouth centre now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
-    ),
-    Field(
-        "predicted_mouth",
-        ("T", 5, 3),
-        "float64",
-        "m",
-        "world",
-        "Mouth centre k = 1…5 frames ahead as a trained predictor foretold it, its last error held "
-        "between video frames: x, y, z; only where the recorded motion came with predictions",
-        since=2,
-    ),
-    Field(
-        "head_orientation",
-        ("T", 4),
-        "float64",
-        "1",
-        "world",
-        "True head orientation now: quaternion w, x, y, z",
-        "unit quaternion",
-    ),
-    Field(
-        "jaw_opening",
-        ("T",),
-        "float64",
-        "m",
-        "",
-        "Distance between the middle of the inner lips, now",
-        "not negative",
-    ),
-    Field(
-        "object_pose",
-        ("T", 7),
-        "float64",
-        "m, 1",
-        "world",
-        "The cube: x, y, z, then quaternion w, x, y, z",
-        "unit quaternion",
-    ),
+)
+"""Fields of every episode, before those of the task."""
+
+_OUTCOME_FIELDS = (
     Field(
         "phase",
         ("T",),
@@ -179,13 +127,15 @@ FIELDS: tuple[Field, ...] = (
         "Simulator velocities, all of them",
     ),
 )
-FIELD_BY_NAME: Mapping[str, Field] = {field.name: field for field in FIELDS}
+"""Fields of every episode, after those of the task."""
 
-ATTRIBUTES: tuple[Attribute, ...] = (
-    Attribute("schema", "text", f"Always `{SCHEMA}`", derived=True),
-    Attribute("schema_version", "int", "Version of this page's tables", derived=True),
-    Attribute("content_sha256", "text", "SHA-256 over everything else in the file", derived=True),
-    Attribute("num_steps", "int", "T", derived=True),
+_EPISODE_ATTRIBUTES = (
+    Attribute("schema", "text", f"Always `{SCHEMA}`", is_derived=True),
+    Attribute("schema_version", "int", "Version of this page's tables", is_derived=True),
+    Attribute(
+        "content_sha256", "text", "SHA-256 over everything else in the file", is_derived=True
+    ),
+    Attribute("num_steps", "int", "T", is_derived=True),
     Attribute("env_id", "text", "Registered Gymnasium id"),
     Attribute("env_kwargs", "json", "Keyword arguments given to `gymnasium.make`"),
     Attribute("seed", "int", "Seed given to `env.reset`"),
@@ -193,14 +143,10 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("is_success", "bool", "Whether the episode fulfilled the task"),
     Attribute("is_success_strict", "bool", "Whether it fulfilled the strict condition"),
     Attribute("completion_time", "float", "Completion time in s; NaN if the task was not done"),
-    Attribute("motion_clip", "text", "Clip that the face's motion was recorded from"),
-    Attribute("motion_subject", "text", "Person in that clip"),
-    Attribute("motion_start_index", "int", "First sample of the segment in the motion library"),
-    Attribute("motion_start_time", "float", "Start of the segment within its run, in s"),
-    Attribute("face_offset", "vector", "Offset of the face's base position, in m", length=3),
-    Attribute(
-        "object_initial_pose", "vector", "Start pose of the cube, as `object_pose`", length=7
-    ),
+)
+"""Attributes of every episode, before those of the task."""
+
+_RECORDING_ATTRIBUTES = (
     Attribute("control_period", "float", "Time between rows, in s"),
     Attribute("prediction_period", "float", "Time between horizons of `mouth_position`, in s"),
     Attribute("phase_names", "json", "List of names that `phase` points into"),
@@ -208,27 +154,73 @@ ATTRIBUTES: tuple[Attribute, ...] = (
     Attribute("action_names", "json", "List of A names, the columns of `action`"),
     Attribute("xml_hash", "text", "SHA-256 of the compiled model's XML"),
     Attribute("versions", "json", "Versions of python, mujoco, numpy and of this package"),
-    Attribute("cameras", "json", "List of the cameras recorded, perhaps empty", derived=True),
+    Attribute("cameras", "json", "List of the cameras recorded, perhaps empty", is_derived=True),
     Attribute("image_codec", "text", "`jpeg`, `png` or `raw`"),
     Attribute("image_quality", "int", "JPEG quality, 1…100; without meaning for other codecs"),
     Attribute(
         "image_size",
         "json",
         "Height and width of every image, in pixels; [0, 0] without cameras",
-        derived=True,
+        is_derived=True,
     ),
 )
-ATTRIBUTE_BY_NAME: Mapping[str, Attribute] = {item.name: item for item in ATTRIBUTES}
+"""Attributes of every episode, after those of the task."""
 
 
-def version_of(fields: Iterable[str]) -> int:
-    """Return the schema version of a file with these fields."""
-    return max([1, *(FIELD_BY_NAME[name].since for name in fields)])
+@dataclass(frozen=True)
+class EpisodeSchema:
+    """Content of the episode files of a task.
 
+    Attributes:
+        fields: arrays, in the order of the content digest.
+        attributes: likewise.
+        version: lowest schema version that describes a file.
+    """
 
-def fields_of(version: int) -> tuple[str, ...]:
-    """Return the names of the fields that files of a schema version hold."""
-    return tuple(field.name for field in FIELDS if field.since <= version)
+    fields: tuple[Field, ...]
+    attributes: tuple[Attribute, ...]
+    version: int
+
+    @classmethod
+    @cache
+    def of(cls, task: TaskEntry | None) -> EpisodeSchema:
+        """Return the schema of a task; without one, what all tasks have in common."""
+        fields, attributes = (task.fields, task.attributes) if task else ((), ())
+        return cls(
+            (*_STATE_FIELDS, *fields, *_OUTCOME_FIELDS),
+            (*_EPISODE_ATTRIBUTES, *attributes, *_RECORDING_ATTRIBUTES),
+            task.schema_version if task else SCHEMA_VERSION,
+        )
+
+    @cached_property
+    def by_name(self) -> dict[str, Field]:
+        """Name -> field."""
+        return {field.name: field for field in self.fields}
+
+    @cached_property
+    def attribute_by_name(self) -> dict[str, Attribute]:
+        """Name -> attribute."""
+        return {item.name: item for item in self.attributes}
+
+    def version_of(self, names: Iterable[str]) -> int:
+        """Return the schema version of a file with these fields."""
+        return max([self.version, *(self.by_name[name].since for name in names)])
+
+    def fields_of(self, version: int, present: Iterable[str] = ()) -> tuple[str, ...]:
+        """Return the names of the fields that a file holds, or should.
+
+        Args:
+            version: schema version of the file.
+            present: names in the file; optional fields of version 3 and later count if there.
+        """
+        found = set(present)
+        return tuple(
+            field.name
+            for field in self.fields
+            if (
+                field.name in found if field.is_optional and version > 2 else field.since <= version
+            )
+        )
 
 
 def shape_text(field: Field) -> str:
@@ -236,21 +228,21 @@ def shape_text(field: Field) -> str:
     return f"({', '.join(map(str, field.shape))}{',' if len(field.shape) == 1 else ''})"
 
 
-def field_table() -> str:
+def field_table(schema: EpisodeSchema) -> str:
     """The fields as a Markdown table, as printed in ``docs/episode_format.md``."""
     lines = ["| name | shape | type | unit | frame | what it is |", "|---|---|---|---|---|---|"]
     lines += [
         f"| `{f.name}` | {shape_text(f)} | {f.dtype} | {f.unit or '–'} | {f.frame or '–'} "
         f"| {f.description} |"
-        for f in FIELDS
+        for f in schema.fields
     ]
     return "\n".join(lines)
 
 
-def attribute_table() -> str:
+def attribute_table(schema: EpisodeSchema) -> str:
     """The attributes as a Markdown table, as printed in ``docs/episode_format.md``."""
     lines = ["| name | kind | what it is |", "|---|---|---|"]
-    for item in ATTRIBUTES:
+    for item in schema.attributes:
         kind = f"{item.length} numbers" if item.kind == "vector" else item.kind
         lines.append(f"| `{item.name}` | {kind} | {item.description} |")
     return "\n".join(lines)
@@ -317,13 +309,15 @@ def loaded_attribute(item: Attribute, value: Any) -> Any:
 
 
 def content_digest(
+    schema: EpisodeSchema,
     arrays: Mapping[str, np.ndarray],
     checksums: Mapping[str, np.ndarray],
     attributes: Mapping[str, Any],
 ) -> str:
-    """SHA-256 over everything an episode says, whatever the library that laid out the file.
+    """Return the SHA-256 over the content of an episode, whatever library laid out the file.
 
     Args:
+        schema: of the task.
         arrays: every field of the table that the episode has.
         checksums: camera -> (T,) uint32, the CRC-32 of its encoded frames.
         attributes: every attribute as `loaded_attribute` gives it; ``content_sha256`` is skipped.
@@ -332,13 +326,13 @@ def content_digest(
         64 hexadecimal digits.
     """
     digest = hashlib.sha256()
-    for field in FIELDS:
+    for field in schema.fields:
         if field.name in arrays:
             array = np.asarray(arrays[field.name]).astype(field.dtype)
             _add_array(digest, field.name, array)
     for camera in sorted(checksums):
         _add_array(digest, camera, np.asarray(checksums[camera], dtype=np.uint32))
-    for item in ATTRIBUTES:
+    for item in schema.attributes:
         if item.name != "content_sha256":
             digest.update(f"{item.name}={_canonical(attributes[item.name])}\n".encode())
     return digest.hexdigest()
@@ -347,7 +341,7 @@ def content_digest(
 def episode_consistency(
     attributes: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> list[str]:
-    """What attributes and arrays say about one another."""
+    """Return contradictions between attributes and arrays."""
     problems: list[str] = []
     for name, field, axis in (
         ("joint_names", "joint_position", 1),
@@ -381,11 +375,11 @@ def _canonical(value: Any) -> str:
 QUATERNION_TOLERANCE = 1e-5
 
 
-def shape_problems(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
+def shape_problems(schema: EpisodeSchema, shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
     """Compare the shapes of all fields present with the table and with one another."""
     problems: list[str] = []
     sizes: dict[str, tuple[int, str]] = {}  # symbol -> (size, field that set it)
-    for field in FIELDS:
+    for field in schema.fields:
         shape = shapes.get(field.name)
         if shape is None:
             continue

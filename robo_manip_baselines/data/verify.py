@@ -1,4 +1,4 @@
-"""Finding damage in a folder of episodes that should belong together."""
+"""Verification of episode files, and of a folder of episodes that should belong together."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ from robo_manip_baselines.data.episode import (
     one_line,
     open_hdf5,
     require_schema,
+    task_of,
 )
 from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes, seed_of
 from robo_manip_baselines.data.schema import (
-    ATTRIBUTE_BY_NAME,
-    ATTRIBUTES,
-    FIELD_BY_NAME,
-    FIELDS,
     IMAGE_GROUP,
+    POLICY_ATTRIBUTES,
+    EpisodeSchema,
     content_digest,
     episode_consistency,
     loaded_attribute,
@@ -38,20 +37,8 @@ from robo_manip_baselines.data.schema import (
 )
 from robo_manip_baselines.runs.errors import RequestError
 
-__all__ = ["Problem", "damage_summary", "verify_dataset", "verify_file"]
-
-# What a folder's episodes must share for one policy to learn from them.
-SHARED_ATTRIBUTES = (
-    "env_id",
-    "env_kwargs",
-    "xml_hash",
-    "cameras",
-    "image_size",
-    "control_period",
-    "prediction_period",
-    "action_names",
-    "joint_names",
-)
+SHARED_ATTRIBUTES = (*POLICY_ATTRIBUTES, "env_kwargs", "cameras", "image_size")
+"""Attributes that the episodes of a folder must share."""
 
 
 def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
@@ -71,7 +58,7 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
     if not paths:
         raise RequestError(f"'{folder}' holds no episode_*.hdf5 file")
     problems: list[Problem] = []
-    with ThreadPoolExecutor(max_workers=2) as pool:  # HDF5 is serial; decoding pictures is not
+    with ThreadPoolExecutor(max_workers=2) as pool:  # HDF5 is serial; decoding images is not
         found = pool.map(lambda path: verify_file(path, images=images), paths)
         for of_one_file in tqdm(found, total=len(paths), unit="file", disable=None):
             problems += of_one_file
@@ -83,10 +70,10 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """What can be read of a file's attributes; its damage has been reported already."""
+    """Return the attributes that can be read; damage has been reported already."""
     try:
         with open_hdf5(path) as file:
-            return readable_attributes(file)[0]
+            return readable_attributes(file, _schema(file))[0]
     except (EpisodeFileError, *READ_ERRORS):
         return {}
 
@@ -158,31 +145,43 @@ def verify_file(path: str | Path, *, images: bool = True) -> list[Problem]:
 
     Args:
         path: the file.
-        images: read and decode every picture, too; without it only their number is checked.
+        images: read and decode every image, too; otherwise only their number is checked.
     """
     path = Path(path)
     try:
         with open_hdf5(path) as file:
             require_schema(path, file)
-            return _file_problems(path, file, images)
+            return _file_problems(path, file, _schema(file), images)
     except EpisodeFileError as error:
         return [Problem(path, str(error).removeprefix(f"'{path}' ").removeprefix("is "))]
     except READ_ERRORS as error:
         return [Problem(path, f"cannot be read: {one_line(error)}")]
 
 
-def _file_problems(path: Path, file: h5py.File, images: bool) -> list[Problem]:
-    attributes, messages = readable_attributes(file)
-    arrays, found = _arrays(file, attributes.get("schema_version", 1))
+def _schema(file: h5py.File) -> EpisodeSchema:
+    """Return the schema of the file's task; what all tasks share if that cannot be read."""
+    try:
+        return EpisodeSchema.of(task_of(file))
+    except READ_ERRORS as error:
+        if isinstance(error, RequestError):
+            raise EpisodeFileError(str(error)) from error
+        return EpisodeSchema.of(None)
+
+
+def _file_problems(
+    path: Path, file: h5py.File, schema: EpisodeSchema, images: bool
+) -> list[Problem]:
+    attributes, messages = readable_attributes(file, schema)
+    arrays, found = _arrays(file, schema, attributes.get("schema_version", 1))
     messages += found
     shapes = {name: array.shape for name, array in arrays.items()}
-    wrong_shapes = shape_problems(shapes)
+    wrong_shapes = shape_problems(schema, shapes)
     messages += wrong_shapes
     phases = attributes.get("phase_names")
     if not wrong_shapes:
         for name, array in arrays.items():
             messages += value_problems(
-                FIELD_BY_NAME[name], array, len(phases) if isinstance(phases, list) else None
+                schema.by_name[name], array, len(phases) if isinstance(phases, list) else None
             )
         messages += episode_consistency(attributes, arrays)
     checksums: dict[str, np.ndarray] = {}
@@ -196,20 +195,21 @@ def _file_problems(path: Path, file: h5py.File, images: bool) -> list[Problem]:
         if images:
             messages += _image_problems(frames, camera, attributes)
     if not messages and (
-        content_digest(arrays, checksums, attributes) != attributes["content_sha256"]
+        content_digest(schema, arrays, checksums, attributes) != attributes["content_sha256"]
     ):
         messages.append("contents do not fit 'content_sha256': something was changed")
     problems = [Problem(path, message) for message in messages]
     return problems + [
-        Problem(path, f"unknown {name}", is_warning=True) for name in _unknown(file, attributes)
+        Problem(path, f"unknown {name}", is_warning=True)
+        for name in _unknown(file, schema, attributes)
     ]
 
 
-def readable_attributes(file: h5py.File) -> tuple[dict[str, Any], list[str]]:
+def readable_attributes(file: h5py.File, schema: EpisodeSchema) -> tuple[dict[str, Any], list[str]]:
     """The attributes that can be read, and what is wrong with the others."""
     attributes: dict[str, Any] = {}
     problems: list[str] = []
-    for item in ATTRIBUTES:
+    for item in schema.attributes:
         if item.name not in file.attrs:
             problems.append(f"attribute '{item.name}' is missing")
             continue
@@ -220,13 +220,13 @@ def readable_attributes(file: h5py.File) -> tuple[dict[str, Any], list[str]]:
     return attributes, problems
 
 
-def _arrays(file: h5py.File, version: int) -> tuple[dict[str, np.ndarray], list[str]]:
+def _arrays(
+    file: h5py.File, schema: EpisodeSchema, version: int
+) -> tuple[dict[str, np.ndarray], list[str]]:
     arrays: dict[str, np.ndarray] = {}
     problems: list[str] = []
-    for field in FIELDS:
-        dataset = file.get(field.name)
-        if dataset is None and field.since > version:
-            continue
+    for name in schema.fields_of(version, file):
+        field, dataset = schema.by_name[name], file.get(name)
         if not isinstance(dataset, h5py.Dataset):
             problems.append(f"'{field.name}' is missing")
         elif dataset.dtype != np.dtype(field.dtype):
@@ -265,11 +265,13 @@ def _image_problems(frames: FrameStore, camera: str, attributes: dict[str, Any])
     return problems.values()
 
 
-def _unknown(file: h5py.File, attributes: dict[str, Any]) -> Iterable[str]:
+def _unknown(file: h5py.File, schema: EpisodeSchema, attributes: dict[str, Any]) -> Iterable[str]:
     """Keys that the table does not know: of another release, or put there by somebody."""
-    known = {*FIELD_BY_NAME, IMAGE_GROUP}
+    known = {*schema.by_name, IMAGE_GROUP}
     yield from (f"key '{name}'" for name in file if name not in known)
-    yield from (f"attribute '{name}'" for name in file.attrs if name not in ATTRIBUTE_BY_NAME)
+    yield from (
+        f"attribute '{name}'" for name in file.attrs if name not in schema.attribute_by_name
+    )
     cameras = set(_names(attributes.get("cameras")))
     members = file.get(IMAGE_GROUP)
     if isinstance(members, h5py.Group):

@@ -1,18 +1,33 @@
-"""What a policy is shown: which components, in which order, and how they are built from truth."""
+"""Observations: what a policy is shown, packed from the simulator's state after corruption."""
 
-from robo_manip_baselines.observation.corruption import ERRORS, Corruption
-from robo_manip_baselines.observation.spec import CAMERAS, MAX_HORIZON, PRESETS, ObservationSpec
-from robo_manip_baselines.observation.state import FRAME_PERIOD, Report, Truth, observe
+from robo_manip_baselines.observation.corruption import ERRORS, Corruption, CorruptionPipeline
+from robo_manip_baselines.observation.spec import (
+    ARM_JOINTS,
+    CAMERAS,
+    PRESETS,
+    ObservationSpec,
+    ObservedNames,
+)
+from robo_manip_baselines.observation.state import (
+    FRAME_PERIOD,
+    FRAME_RATE,
+    MAX_HORIZON,
+    State,
+    TargetObservation,
+)
 
 __all__ = [
+    "ARM_JOINTS",
     "CAMERAS",
     "ERRORS",
     "FRAME_PERIOD",
+    "FRAME_RATE",
     "MAX_HORIZON",
     "PRESETS",
     "Corruption",
+    "CorruptionPipeline",
     "ObservationSpec",
-    "Report",
-    "Truth",
-    "observe",
+    "ObservedNames",
+    "State",
+    "TargetObservation",
 ]

@@ -1,4 +1,8 @@
-"""What stands between the true mouth and the one that is shown, as one frozen dataclass."""
+"""Corruption of the observed target: ``truth -> predict -> error -> delay -> dropout``.
+
+Legend: T control steps, K = 6 frames from now to the longest horizon, H horizons of the error, F
+video frames, J detections at the detector's own rate, ... any shape of times.
+"""
 
 from __future__ import annotations
 
@@ -6,53 +10,74 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import numpy as np
+import tyro
+from numpy.typing import ArrayLike, NDArray
+
+from robo_manip_baselines.observation.error_models import DRAWN_ERRORS, WORLD_FROM_IMAGE, Draw
 from robo_manip_baselines.observation.error_stats import load_error_stats
+from robo_manip_baselines.observation.state import FRAME_RATE, Floats, State, TargetObservation
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
-MEASURED_ERRORS = ("uniform", "gaussian", "empirical")
-"""Errors of the forecast that are drawn, with the statistics of a file."""
+MEASURED_ERRORS = tuple(DRAWN_ERRORS)
+"""Errors of the forecast that are drawn from the statistics of a file."""
 
 ERRORS = ("none", *MEASURED_ERRORS, "model")
 """Errors of the forecast; ``model`` is the recorded output of a trained predictor."""
 
-FRAME_RATE = 30.0
-"""Hz of the video in which the detector looks for the face (paper, section IV.A)."""
-
 DROPOUT_LENGTH = 15.0
-"""frames that the face stays lost, on average, if nothing else is said: half a second."""
+"""Default mean length of a loss of the face, frames: half a second."""
+
+NO_PREDICTION = (
+    "no predicted mouth, which the error 'model' shows; use a motion library that "
+    "'python -m face_prediction predict' wrote, or choose another error"
+)
+"""End of the message where a library or an episode holds no predictions."""
+
+_FIRST_FRAMES = 512
+"""Frames drawn when an episode starts, 17 s; a longer episode draws more."""
+
+_FIRST_STEPS = 1024
+"""Steps allocated when an episode starts; a longer episode allocates more."""
+
+_TIME_ROUNDING = 1e-7
+"""s by which times that are meant to be the same may differ."""
+
+_FRAME_ROUNDING = 1e-6
+"""Frames by which a time may fall short of a frame and still belong to it."""
 
 
 @dataclass(frozen=True)
 class Corruption:
-    """Errors of the forecast, delay, lost faces, and a detector that is slower than the robot.
+    """Errors of the forecast, delay, lost faces, and a detector slower than the robot.
 
-    Everything is off by default; ``None`` in place of a `Corruption` turns all of it off.
+    Everything is off by default, and a `Corruption` that is off is false.
 
     Attributes:
-        error: of the forecast: ``none``; ``uniform``, the paper's; ``gaussian``; ``empirical``,
-            measured ones played again; ``model``, the recorded output of a trained predictor.
-        error_stats: file of error statistics; the one that ships with the package if None.
+        error: Error of the forecast: none, uniform (the paper's), gaussian, empirical (measured
+            errors replayed) or model (recorded output of a trained predictor).
+        error_stats: File of error statistics; the shipped one if None.
         stats_sha256: SHA-256 of that file, where a policy was trained with it; any if None.
-        delay: frames of 1/30 s from the camera to the policy.
-        face_dropout: share of the frames, 0 up to 1, in which the face is lost.
-        face_dropout_length: mean frames of a loss.
-        detector_rate: reports of the detector per second, at most 30; at every step if None.
-        seed: of everything that is drawn, beside the seed of the episode.
+        delay: Frames of 1/30 s from the camera to the policy.
+        face_dropout: Share of the frames, 0 up to 1, in which the face is lost.
+        face_dropout_length: Mean length of a loss, frames.
+        detector_rate: Detections per second, at most 30; one at every control step if None.
+        seed: Seed of errors and losses, beside that of the episode.
 
     Raises:
-        RequestError: a value that is not valid.
+        RequestError: a value is not valid.
     """
 
     error: str = "none"
     error_stats: str | None = None
-    stats_sha256: str | None = None
+    stats_sha256: tyro.conf.Suppress[str | None] = None
     delay: int = 0
     face_dropout: float = 0.0
     face_dropout_length: float = DROPOUT_LENGTH
     detector_rate: float | None = None
-    seed: int = 0
+    seed: Annotated[int, tyro.conf.arg(name="corruption_seed")] = 0
 
     def __post_init__(self) -> None:
         require_choice("error model", self.error, ERRORS)
@@ -78,36 +103,49 @@ class Corruption:
         if rate is not None and not 0.0 < rate <= FRAME_RATE:
             raise RequestError(
                 f"detector_rate {rate:g}: must be above 0 and at most {FRAME_RATE:g} Hz, the "
-                "camera's; leave it out for a report at every step"
+                "camera's; leave it out for a detection at every step"
             )
         if self.seed < 0:
             raise RequestError(f"seed {self.seed} of the corruption: must be 0 or more")
 
     @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Corruption:
-        """Make one from its fields, as they come out of JSON.
+    def from_json(cls, values: Mapping[str, Any]) -> Corruption:
+        """Build one from its fields, as JSON holds them.
 
         Raises:
-            RequestError: a value or a name that is not valid.
+            RequestError: a value or a name is not valid.
         """
         names = [field.name for field in fields(cls)]
         for name in values:
             require_choice("setting of the corruption", name, names)
         return cls(**values)
 
-    @property
-    def is_off(self) -> bool:
-        """Whether the truth is shown."""
-        return (
-            self.error == "none"
-            and not self.delay
-            and not self.face_dropout
-            and self.detector_rate is None
+    def override(self, changes: Mapping[str, Any]) -> Corruption:
+        """Return the same with other settings; what no longer fits the error is dropped.
+
+        Raises:
+            RequestError: a value is not valid.
+        """
+        start = self
+        if changes.get("error", self.error) not in MEASURED_ERRORS:
+            start = replace(self, error="none", error_stats=None, stats_sha256=None)
+            changes = {"error": self.error, **changes}
+        elif "error_stats" in changes:
+            start = replace(self, stats_sha256=None)
+        return replace(start, **changes)
+
+    def __bool__(self) -> bool:
+        """Return whether anything is corrupted."""
+        return bool(
+            self.error != "none"
+            or self.delay
+            or self.face_dropout
+            or self.detector_rate is not None
         )
 
     @property
     def label(self) -> str:
-        """Name what is corrupted and how, for arms and folders: ``uniform_delay3``."""
+        """Name for conditions and folders, such as ``uniform_delay3``."""
         parts = []
         if self.error != "none":
             stem = f"_{Path(self.error_stats).stem}" if self.error_stats else ""
@@ -115,17 +153,26 @@ class Corruption:
         if self.delay:
             parts.append(f"delay{self.delay}")
         if self.face_dropout:
-            length = (
-                f"x{self.face_dropout_length:g}"
-                if self.face_dropout_length != DROPOUT_LENGTH
-                else ""
-            )
-            parts.append(f"dropout{self.face_dropout:g}{length}")
+            length = self.face_dropout_length
+            suffix = f"x{length:g}" if length != DROPOUT_LENGTH else ""
+            parts.append(f"dropout{self.face_dropout:g}{suffix}")
         if self.detector_rate is not None:
             parts.append(f"rate{self.detector_rate:g}")
         if self.seed:
             parts.append(f"draw{self.seed}")
         return "_".join(parts)
+
+    def __str__(self) -> str:
+        """List what differs from the defaults, in the names of the options."""
+        changed = {
+            item.name: getattr(self, item.name)
+            for item in fields(self)
+            if getattr(self, item.name) != item.default
+        }
+        return ", ".join(
+            f"{name} {value[:12] if name == 'stats_sha256' else value}"
+            for name, value in changed.items()
+        ) or ("no corruption")
 
     def pinned(self) -> Corruption:
         """Return the same with the SHA-256 of its file of statistics, if it uses one.
@@ -137,3 +184,229 @@ class Corruption:
             return self
         stats = load_error_stats(self.error_stats, self.stats_sha256)
         return replace(self, stats_sha256=stats.sha256)
+
+    def is_same_as(self, other: Corruption) -> bool:
+        """Return whether both corrupt alike; statistics count by digest, not by path."""
+        if not (self or other):
+            return True
+        return replace(self, error_stats=None) == replace(other, error_stats=None)
+
+
+@dataclass(frozen=True)
+class DetectionTiming:
+    """Moment of the past that is observed at each moment of an episode.
+
+    Attributes:
+        delay: s.
+        rate: detections a second; None for one at every moment.
+        last_found: (F,) the last frame, up to each, in which the face was found.
+        last_detection: (J,) the last detection, up to each, that found it; empty without a rate.
+    """
+
+    delay: float
+    rate: float | None
+    last_found: NDArray[np.int64]
+    last_detection: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, corruption: Corruption, lost: NDArray[np.bool_]) -> DetectionTiming:
+        """Lay out an episode of F frames, in some of which, (F,), the face is lost."""
+        last_found = np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
+        rate, last_detection = corruption.detector_rate, np.zeros(0, np.int64)
+        if rate is not None:
+            detections = np.arange(int(frame_of(len(lost) / FRAME_RATE, rate)) + 1)
+            is_lost = lost[np.minimum(frame_of(detections / rate), len(lost) - 1)]
+            last_detection = np.maximum.accumulate(np.where(is_lost, 0, detections))
+        return cls(corruption.delay / FRAME_RATE, rate, last_found, last_detection)
+
+    def seen_at(self, time: ArrayLike) -> tuple[Floats, NDArray[np.int64]]:
+        """Return when the target observed at ``time`` was seen, and in which video frame.
+
+        Before the first detection can have arrived, the first one is observed. A delay of 3 frames
+        without anything else, at 30 steps a second, the content of step n being n::
+
+            step      0 1 2 3 4 5
+            observed  0 0 0 0 1 2
+
+        Args:
+            time: (...) s since the start of the episode, no later than frame F - 1 lasts.
+
+        Returns:
+            (...) s, never later than ``time``, and (...) the frame whose error it has.
+        """
+        seen = np.maximum(np.asarray(time, dtype=np.float64) - self.delay, 0.0)
+        if self.rate is not None:
+            detection = self.last_detection[frame_of(seen, self.rate)] / self.rate
+            return np.minimum(detection, seen), frame_of(detection)
+        frame = frame_of(seen)
+        found = self.last_found[frame]
+        # While the face is lost, the last sight of it is held.
+        held = np.minimum((found + 1) / FRAME_RATE, seen)
+        return np.where(found < frame, held, seen), found
+
+
+@dataclass(frozen=True)
+class _Draws:
+    """Random draws of an episode: errors (F, H, 3) m, world, or None; and the timing."""
+
+    frames: int
+    error: Floats | None
+    timing: DetectionTiming
+
+
+class CorruptionPipeline:
+    """Corrupts the target step by step, or over a whole recorded episode, to the same numbers.
+
+    Args:
+        corruption: settings.
+        horizon: frames ahead that will be observed.
+
+    Raises:
+        RequestError: the file of error statistics cannot be used.
+    """
+
+    def __init__(self, corruption: Corruption, horizon: int = 0) -> None:
+        self.corruption = corruption
+        self._draw_error: Draw | None = None
+        if corruption.error in MEASURED_ERRORS:
+            stats = load_error_stats(corruption.error_stats, corruption.stats_sha256)
+            if horizon > stats.horizons:
+                raise RequestError(
+                    f"error statistics '{stats.source}' go {stats.horizons} frames ahead; choose "
+                    f"a horizon up to that, not {horizon}, or other statistics"
+                )
+            self._draw_error = DRAWN_ERRORS[corruption.error](stats)
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Start the episode of this seed."""
+        self._seed = seed
+        self._draws = self._draw(seed, _FIRST_FRAMES)
+        self._steps = 0
+        self._time = np.empty(0)
+        self._position = np.empty((0, 0, 3))
+        self._predicted = np.empty((0, 0, 3))
+
+    def observe(self, state: State) -> TargetObservation:
+        """Return the observed target of one step, from this state and those given before.
+
+        Args:
+            state: of one step, later than the step before (or the same once more).
+
+        Raises:
+            RequestError: the error needs a predicted target, and there is none.
+        """
+        self._append(state)
+        time = self._time[: self._steps]
+        frames = int(frame_of(time[-1])) + 1
+        if frames > self._draws.frames:
+            self._draws = self._draw(self._seed, 2 * frames)
+        observed = self._observe_at(
+            self._draws,
+            time,
+            self._position[: self._steps],
+            None if state.predicted_target is None else self._predicted[: self._steps],
+            time[-1:],
+        )
+        return TargetObservation(observed.time[0], observed.position[0])
+
+    def observe_episode(self, state: State, seed: int) -> TargetObservation:
+        """Return the observed target at every step of an episode, as `observe` would have.
+
+        Args:
+            state: of the whole episode, (T, ...).
+            seed: of the episode.
+
+        Raises:
+            RequestError: the error needs a predicted target, and there is none.
+        """
+        draws = self._draw(seed, int(frame_of(state.time[-1])) + 1)
+        return self._observe_at(
+            draws, state.time, state.target_position, state.predicted_target, state.time
+        )
+
+    def _observe_at(
+        self, draws: _Draws, time: Floats, position: Floats, predicted: Floats | None, now: Floats
+    ) -> TargetObservation:
+        """Observe at the moments ``now`` (n,) s, from the states of the T steps ``time``.
+
+        Of steps later than a moment nothing is used at that moment.
+        """
+        seen, error_frame = draws.timing.seen_at(now)
+        row = np.searchsorted(time, seen + _TIME_ROUNDING, side="right") - 1
+        after = np.minimum(row + 1, len(time) - 1)
+        late = seen - time[row]
+        between = late > _TIME_ROUNDING
+        part = np.divide(late, time[after] - time[row], out=np.zeros_like(late), where=between)
+        part = part[:, None, None]
+        # A step itself is observed bit for bit.
+        observed = np.where(
+            part > 0.0, (1.0 - part) * position[row] + part * position[after], position[row]
+        )
+        if draws.error is not None:
+            ahead = min(draws.error.shape[1], observed.shape[1] - 1)
+            observed[:, 1 : ahead + 1] += draws.error[error_frame, :ahead]
+        elif self.corruption.error == "model":
+            if predicted is None:
+                raise RequestError(f"there is {NO_PREDICTION}")
+            # The error that the predictor made in a video frame lasts until the next.
+            made = np.searchsorted(time, error_frame / FRAME_RATE - _TIME_ROUNDING)
+            observed[:, 1:] += predicted[made] - position[made, 1:]
+        return TargetObservation(seen, observed)
+
+    def _append(self, state: State) -> None:
+        if self._steps == len(self._time):
+            more = max(self._steps, _FIRST_STEPS)
+            self._time = _grown(self._time, (), self._steps, more)
+            self._position = _grown(self._position, state.target_position.shape, self._steps, more)
+            if state.predicted_target is not None:
+                shape = state.predicted_target.shape
+                self._predicted = _grown(self._predicted, shape, self._steps, more)
+        self._time[self._steps] = state.time
+        self._position[self._steps] = state.target_position
+        if state.predicted_target is not None:
+            self._predicted[self._steps] = state.predicted_target
+        self._steps += 1
+
+    def _draw(self, seed: int, frames: int) -> _Draws:
+        corruption = self.corruption
+        error = None
+        if self._draw_error:
+            rng = _stream(corruption.seed, seed, "error")
+            error = self._draw_error(rng, frames) @ WORLD_FROM_IMAGE
+        lost = draw_lost(corruption, _stream(corruption.seed, seed, "lost"), frames)
+        return _Draws(frames, error, DetectionTiming.of(corruption, lost))
+
+
+def frame_of(time: ArrayLike, rate: float = FRAME_RATE) -> NDArray[np.int64]:
+    """Return the number of the last frame, the first being 0, that was taken by ``time`` (s)."""
+    return np.floor(np.asarray(time) * rate + _FRAME_ROUNDING).astype(np.int64)
+
+
+def draw_lost(corruption: Corruption, rng: np.random.Generator, frames: int) -> NDArray[np.bool_]:
+    """Draw the frames, (F,), in which the face is lost; never the first.
+
+    A loss lasts a geometrically distributed number of frames; how often one begins follows from the
+    share of frames that are lost in the long run.
+    """
+    if not corruption.face_dropout:
+        return np.zeros(frames, np.bool_)
+    length = corruption.face_dropout_length
+    begins = corruption.face_dropout / ((1.0 - corruption.face_dropout) * length)
+    lost = np.zeros(frames, np.bool_)
+    for frame, chance in enumerate(rng.random(frames).tolist()[1:], start=1):
+        lost[frame] = chance >= 1.0 / length if lost[frame - 1] else chance < begins
+    return lost
+
+
+def _stream(seed: int, episode: int, name: str) -> np.random.Generator:
+    """Return the generator of a named stream of an episode, the same for every condition."""
+    return np.random.default_rng(np.random.SeedSequence([seed, episode, *name.encode()]))
+
+
+def _grown(rows: Floats, shape: tuple[int, ...], known: int, more: int) -> Floats:
+    """Return (known + more, *shape), the first of them as in ``rows``."""
+    larger = np.empty((known + more, *shape))
+    if known:
+        larger[:known] = rows[:known]
+    return larger

@@ -15,7 +15,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from robo_manip_baselines.observation.error_stats import ErrorStats
 from robo_manip_baselines.runs.errors import RequestError
@@ -37,7 +36,7 @@ _SLOWEST = 0.999
 
 
 def uniform(stats: ErrorStats) -> Draw:
-    """Draw every number anew within +-max of equations 6 and 7 (paper, section IV.C).
+    """Draw every number independently within +-max of equations 6 and 7 (paper, section IV.C).
 
     The bound is the mean absolute error of that horizon and axis. So half of it is the mean
     absolute error of what is drawn, and a third of its square the variance. The paper does not say
@@ -85,6 +84,8 @@ def frame_persistence(stats: ErrorStats, gain: Floats) -> Floats:
     # Components with more variance count for more.
     weight = np.sqrt(total / max(float(total.max()), np.finfo(float).tiny))
     wanted = stats.autocorrelation[1].ravel()
+    from scipy.optimize import lsq_linear  # slow to import
+
     fit = lsq_linear(share * weight[:, None], wanted * weight, bounds=(0.0, 1.0))
     return np.minimum(np.maximum(fit.x, 0.0) ** (1.0 / stats.stride), _SLOWEST)
 

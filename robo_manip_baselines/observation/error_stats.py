@@ -1,4 +1,4 @@
-"""``error_stats.json``, as far as errors are drawn from it; `face_prediction` writes it.
+"""Reader of ``error_stats.json``, which ``face_prediction export-stats`` writes.
 
 Legend: H horizons, K lags, n forecasts of a run; the last axis is U, V: right and down in the
 image.
@@ -10,7 +10,6 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,14 @@ from robo_manip_baselines.runs.errors import RequestError
 
 SCHEMA = "error_stats"
 VERSION = 1
-DEFAULT_STATS = Path(str(files("robo_manip_baselines.observation") / "assets/error_stats.json"))
+DEFAULT_STATS = Path(__file__).with_name("assets") / "error_stats.json"
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ErrorStats:
-    """What a predictor's errors look like: forecast minus truth of the mouth centre.
+    """Statistics of a predictor's errors: forecast minus truth of the mouth centre.
 
     Attributes:
         predictor: what made the forecasts.

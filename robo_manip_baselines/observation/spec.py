@@ -1,17 +1,29 @@
-"""What a policy is shown, as one frozen dataclass.
+"""Observation spec: the one declaration of what a policy is shown.
 
-Legend: A arms (1 or 2), H horizon in frames of 1/30 s, C cameras.
+Command-line options, conditions of a benchmark, environment arguments, result rows and labels are
+all made from `ObservationSpec`.
+
+Legend: ... any leading shape, A arms (1 or 2), H horizon in frames of 1/30 s, S elements of all
+vectors of an observation together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
+from typing import Annotated, Any
 
-from robo_manip_baselines.envs.mujoco.cell.vx300s import ARM_JOINTS
-from robo_manip_baselines.observation.corruption import MEASURED_ERRORS, Corruption
+import numpy as np
+from numpy.typing import NDArray
+from tyro.constructors import PrimitiveConstructorSpec
+
+from robo_manip_baselines.observation.corruption import Corruption, CorruptionPipeline
+from robo_manip_baselines.observation.state import (
+    FRAME_PERIOD,
+    MAX_HORIZON,
+    State,
+    TargetObservation,
+)
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 PRESETS = ("baseline", "current", "current_pred")
@@ -20,43 +32,82 @@ PRESETS = ("baseline", "current", "current_pred")
 CAMERAS = ("top", "angle", "front_close")
 """The paper's three views (Fig. 8)."""
 
-ARMS: dict[str, tuple[str, ...]] = {"right": ("right",), "both": ("left", "right")}
-"""Arms that a policy moves and is shown, in the order of the action."""
+ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
+"""Joints of an arm, base to gripper, in the order of state and action."""
 
-MAX_HORIZON = 5
-"""Frames that the predictor of the paper looks ahead (section IV.A)."""
+ARMS: dict[str, tuple[str, ...]] = {"right": ("right",), "both": ("left", "right")}
+"""Arms that a policy moves and observes, in the order of state and action."""
 
 MAX_IMAGE_SIZE = 4096
 
 
-@dataclass(frozen=True)
-class ObservationSpec:
-    """Which components an observation has.
-
-    Attributes:
-        obs: preset: ``baseline`` shows the robot and the cameras, ``current`` adds the mouth and
-            its distance to the gripper, ``current_pred`` the mouth now and in the next frames.
-        horizon: H, frames ahead that ``current_pred`` shows, 1 to 5.
-        cameras: views to show, any of ``CAMERAS``, or none at all.
-        image_size: (height, width) in pixels.
-        object_pose: whether to show the position of the cube.
-        arms: which arms the robot's state speaks of.
-        corruption: what stands between the true and the shown mouth; None, and one that is off,
-            which becomes None, show the truth.
+def parse_image_size(size: str) -> tuple[int, int]:
+    """Return (height, width) from ``HEIGHTxWIDTH``.
 
     Raises:
-        RequestError: a value that is not valid.
+        RequestError: it is not of that form.
+    """
+    height, cross, width = size.lower().partition("x")
+    if not (cross and height.isdecimal() and width.isdecimal()):
+        raise RequestError(f"image size '{size}': must be HEIGHTxWIDTH, for example 480x640")
+    return int(height), int(width)
+
+
+ImageSize = Annotated[
+    tuple[int, int],
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="HEIGHTxWIDTH",
+        instance_from_str=lambda args: parse_image_size(args[0]),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [f"{value[0]}x{value[1]}"],
+    ),
+]
+
+
+@dataclass(frozen=True)
+class ObservedNames:
+    """Names, in the observations of a task, of the tracked point and of the objects.
+
+    Attributes:
+        target: point on the face that the task is about.
+        objects: objects whose positions ``object_pose`` shows.
+    """
+
+    target: str = "mouth"
+    objects: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ObservationSpec:
+    """Declaration of what a policy is shown.
+
+    Attributes:
+        obs: Preset: baseline (robot and cameras), current (also the mouth and its distance to the
+            gripper) or current_pred (the mouth now and in the next frames).
+        horizon: Frames of 1/30 s that current_pred looks ahead, 1 to 5.
+        cameras: Cameras, any of top, angle and front_close, or none.
+        image_size: Height and width of the images in pixels.
+        object_pose: Show the positions of the task's objects.
+        arms: Arms in state and action: right or both.
+        corruption: Corruption of the target between simulator and policy.
+
+    Raises:
+        RequestError: a value is not valid.
     """
 
     obs: str = "baseline"
     horizon: int = 2
     cameras: tuple[str, ...] = CAMERAS
-    image_size: tuple[int, int] = (480, 640)
+    image_size: ImageSize = (480, 640)
     object_pose: bool = False
     arms: str = "right"
-    corruption: Corruption | None = None
+    corruption: Corruption = field(default_factory=Corruption)
 
     def __post_init__(self) -> None:
+        # As command lines write them: "none", and commas in place of spaces.
+        cameras = tuple(name for part in self.cameras for name in part.split(",") if name)
+        object.__setattr__(self, "cameras", () if cameras == ("none",) else cameras)
         require_choice("observation preset", self.obs, PRESETS)
         require_choice("arms", self.arms, ARMS)
         for camera in self.cameras:
@@ -71,147 +122,161 @@ class ObservationSpec:
             raise RequestError(
                 f"image size {self.image_size}: must be height and width, 1 to {MAX_IMAGE_SIZE}"
             )
-
-        if self.corruption and self.corruption.is_off:
-            object.__setattr__(self, "corruption", None)
-        if self.corruption:
-            self._require_something_to_corrupt(self.corruption)
-
-    def _require_something_to_corrupt(self, corruption: Corruption) -> None:
-        if not self.frames:
+        if not self.corruption:
+            object.__setattr__(self, "corruption", Corruption())
+        elif not self.frames:
             raise RequestError(
-                f"'{corruption.label}' corrupts the mouth, of which the observation preset "
+                f"'{self.corruption.label}' corrupts the mouth, of which the observation preset "
                 f"'{self.obs}' shows nothing; leave it out, or choose current or current_pred"
             )
-        if self.obs == "current" and corruption.error != "none":
+        elif self.obs == "current" and self.corruption.error != "none":
             raise RequestError(
-                f"the error '{corruption.error}' is one of forecasts, of which the observation "
-                "preset 'current' shows none; choose current_pred, or the error none (delay, "
-                "face_dropout and detector_rate go with 'current', too)"
+                f"the error '{self.corruption.error}' is one of forecasts, of which the "
+                "observation preset 'current' shows none; choose current_pred, or the error none "
+                "(delay, face_dropout and detector_rate go with 'current', too)"
             )
+
+    # -- other forms ----------------------------------------------------------------------------
 
     def to_json(self) -> dict[str, Any]:
         """Return what JSON can hold; without a corruption as releases before there was one."""
         values = asdict(self)
         arms, corruption = values.pop("arms"), values.pop("corruption")
-        values |= {"error": self.corruption.error if self.corruption else "none", "arms": arms}
-        return values | {"corruption": corruption} if corruption else values
+        values |= {"error": self.corruption.error, "arms": arms}
+        return values | {"corruption": corruption} if self.corruption else values
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> ObservationSpec:
         """Return the spec that ``to_json`` was called on.
 
         Raises:
-            RequestError: a value that is not valid.
-            TypeError: a name that is unknown.
+            RequestError: a value is not valid.
+            TypeError: a name is unknown.
         """
         given: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
         }
-        corruption = given.pop("corruption", None)
         given.pop("error", None)
-        return cls(**given, corruption=corruption and Corruption.of(corruption))
+        corruption = Corruption.from_json(given.pop("corruption", None) or {})
+        return cls(**given, corruption=corruption)
+
+    def env_kwargs(self) -> dict[str, Any]:
+        """Return the arguments of an environment that shows this."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        corruption = values.pop("corruption")
+        return values | {"corruption": asdict(corruption) if corruption else None}
+
+    @property
+    def name(self) -> str:
+        """Name of the condition, such as ``current_pred_h2_uniform``."""
+        horizon = f"_h{self.horizon}" if self.obs == "current_pred" else ""
+        corruption = f"_{self.corruption.label}" if self.corruption else ""
+        return f"{self.obs}{horizon}{corruption}"
+
+    # -- content --------------------------------------------------------------------------------
 
     @property
     def arm_names(self) -> tuple[str, ...]:
-        """The arms in the order of state and action."""
+        """Arms in the order of state and action."""
         return ARMS[self.arms]
 
     @property
     def frames(self) -> int:
-        """How many mouth positions, from now on, the preset shows."""
+        """Number of target positions, from now on, that the preset shows."""
         return {"baseline": 0, "current": 1, "current_pred": self.horizon + 1}[self.obs]
 
-    def components(self) -> dict[str, tuple[str, ...]]:
-        """Name every element of every vector of the observation, in order."""
-        named = {"state": tuple(_state_names(self.arm_names))}
+    def components(self, names: ObservedNames) -> dict[str, tuple[str, ...]]:
+        """Return the names of the elements of every vector of the observation, in order."""
+        parts = {"state": tuple(_state_names(self.arm_names))}
         if self.obs == "current":
-            named["mouth"] = ("mouth x", "mouth y", "mouth z", "distance")
+            target = names.target
+            parts[target] = (f"{target} x", f"{target} y", f"{target} z", "distance")
         if self.obs == "current_pred":
             steps = range(self.frames)
-            named["prediction"] = tuple(
+            parts["prediction"] = tuple(
                 [f"{axis}_{k}" for k in steps for axis in "txyz"] + [f"distance_{k}" for k in steps]
             )
         if self.object_pose:
-            named["object_position"] = ("cube x", "cube y", "cube z")
-        return named
+            parts["object_position"] = tuple(
+                f"{item} {axis}" for item in names.objects for axis in "xyz"
+            )
+        return parts
+
+    def vector_names(self, names: ObservedNames) -> list[str]:
+        """Return the names of the S elements of the packed vector."""
+        return [name for part in self.components(names).values() for name in part]
 
     def image_keys(self) -> dict[str, str]:
-        """Map keys of the observation to cameras."""
+        """Map image keys of the observation to cameras."""
         return {f"images/{camera}": camera for camera in self.cameras}
+
+    def make_pipeline(self) -> CorruptionPipeline | None:
+        """Return the corruption pipeline; None where the policy is shown the truth."""
+        return CorruptionPipeline(self.corruption, self.frames - 1) if self.corruption else None
+
+    def pack(self, state: State, target: TargetObservation | None = None) -> NDArray[np.float32]:
+        """Pack all vectors of an observation into one.
+
+        Args:
+            state: of any leading shape.
+            target: of the same leading shape, from the corruption pipeline; the truth if None.
+
+        Returns:
+            (..., S) float32. The distances are those from the gripper now to the target as
+            observed.
+
+        Raises:
+            ValueError: a target is given without a corruption, or the other way round.
+        """
+        if (target is None) != (not self.corruption):
+            raise ValueError("an observed target goes with a corruption, and only with one")
+        observed = target or TargetObservation(state.time, state.target_position)
+        arms = np.concatenate(
+            [
+                state.joint_position,
+                state.joint_velocity,
+                state.gripper_position[..., None],
+                state.gripper_velocity[..., None],
+            ],
+            axis=-1,
+        )
+        parts = [arms.reshape(*arms.shape[:-2], -1)]
+        if self.frames:
+            position = observed.position[..., : self.frames, :]
+            distance = np.linalg.norm(position - state.end_effector_position[..., None, :], axis=-1)
+            if self.obs == "current":
+                parts += [position[..., 0, :], distance]
+            else:
+                time = observed.time[..., None] + np.arange(self.frames) * FRAME_PERIOD
+                timed = np.concatenate([time[..., None], position], axis=-1)
+                parts += [timed.reshape(*timed.shape[:-2], -1), distance]
+        if self.object_pose:
+            objects = state.object_position
+            parts.append(objects.reshape(*objects.shape[:-2], -1))
+        return np.concatenate([part.astype(np.float32) for part in parts], axis=-1)
+
+    def split(
+        self, vector: NDArray[np.float32], names: ObservedNames
+    ) -> dict[str, NDArray[np.float32]]:
+        """Return the vectors (..., n) of an observation as views of the packed one (..., S)."""
+        components = self.components(names)
+        ends = np.cumsum([len(part) for part in components.values()])
+        return dict(zip(components, np.split(vector, ends[:-1], axis=-1), strict=True))
+
+    def target_positions(self, vector: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the target positions, (F, 3) m, in a packed vector (S,); F is 0 for baseline."""
+        start = len(_state_names(self.arm_names))
+        if self.obs == "current":
+            return vector[None, start : start + 3].astype(np.float64)
+        timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
+        return timed[:, 1:].astype(np.float64)
 
 
 def _state_names(arms: Sequence[str]) -> list[str]:
-    """Name the 14 numbers of each arm: positions, velocities, gripper (paper, section IV.C)."""
+    """Return the 14 names of each arm: positions, velocities, gripper (paper, section IV.C)."""
     names: list[str] = []
     for arm in arms:
         names += [f"{arm}/{joint} position" for joint in ARM_JOINTS]
         names += [f"{arm}/{joint} velocity" for joint in ARM_JOINTS]
         names += [f"{arm}/gripper position", f"{arm}/gripper velocity"]
     return names
-
-
-@dataclass(frozen=True)
-class CorruptionOptions:
-    """What stands between the true mouth and the one that a policy is shown; see `Corruption`."""
-
-    error: str | None = None
-    """Error of the forecast: none, uniform (the paper's), gaussian, empirical or model."""
-    error_stats: Path | None = None
-    """File of error statistics; the one that ships with the package if not given."""
-    delay: int | None = None
-    """Frames of 1/30 s from the camera to the policy; 0 if not given."""
-    face_dropout: float | None = None
-    """Share of the frames in which the face is lost; 0 if not given."""
-    face_dropout_length: float | None = None
-    """Mean frames of a loss; 15 if not given."""
-    detector_rate: float | None = None
-    """Reports of the detector per second, at most 30; one at every step if not given."""
-    corruption_seed: int | None = None
-    """Seed of errors and losses, beside that of the episode; 0 if not given."""
-    corruption: bool = True
-    """--no_corruption shows the truth, whatever else is said."""
-
-    def apply(self, before: Corruption | None = None) -> Corruption | None:
-        """Return the corruption that results when what was given replaces what was there before.
-
-        Raises:
-            RequestError: a value that is not valid.
-        """
-        given = {
-            "error": self.error,
-            "error_stats": self.error_stats and str(self.error_stats),
-            "delay": self.delay,
-            "face_dropout": self.face_dropout,
-            "face_dropout_length": self.face_dropout_length,
-            "detector_rate": self.detector_rate,
-            "seed": self.corruption_seed,
-        }
-        changes = {name: value for name, value in given.items() if value is not None}
-        if not self.corruption:
-            return None
-        start = before or Corruption()
-        if changes.get("error", start.error) not in MEASURED_ERRORS:
-            start = replace(start, error_stats=None, stats_sha256=None)
-        elif self.error_stats is not None:
-            start = replace(start, stats_sha256=None)
-        result = replace(start, **changes)
-        return None if result.is_off else result
-
-
-def parse_cameras(cameras: tuple[str, ...]) -> tuple[str, ...]:
-    """Return camera names; ``none`` stands for no camera at all, and commas may separate them."""
-    names = tuple(name for part in cameras for name in part.split(",") if name)
-    return () if names == ("none",) else names
-
-
-def parse_image_size(size: str) -> tuple[int, int]:
-    """Return (height, width) from ``HEIGHTxWIDTH``.
-
-    Raises:
-        RequestError: it is not of that form.
-    """
-    height, cross, width = size.lower().partition("x")
-    if not (cross and height.isdecimal() and width.isdecimal()):
-        raise RequestError(f"image size '{size}': must be HEIGHTxWIDTH, for example 480x640")
-    return int(height), int(width)

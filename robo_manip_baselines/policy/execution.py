@@ -8,7 +8,7 @@ Every environment is at a step of its own; its actions depend on its own episode
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.state import to_vector, vector_names
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -104,8 +103,7 @@ class ActionQueue:
     ) -> None:
         if not 1 <= n_action_steps <= chunk_size:
             raise RequestError(
-                f"n_action_steps (--execute) {n_action_steps}: must be 1 to {chunk_size}, the "
-                "chunk size"
+                f"n_action_steps {n_action_steps}: must be 1 to {chunk_size}, the chunk size"
             )
         self._queue = np.zeros((num_envs, n_action_steps, action_size), dtype=np.float32)
         self._used = np.full(num_envs, n_action_steps)
@@ -188,10 +186,10 @@ class PolicyRunner:
         self._model = fast.to(self._device)
         if spec.cameras:
             self._model = self._model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._spec, self._normalization = spec, normalization
+        self._has_images, self._normalization = bool(spec.cameras), normalization
         self._chunk_shape = model.chunk_size, len(normalization.action_mean)
         self._buffer = make_action_buffer(execution, num_envs, *self._chunk_shape)
-        steps, state_size = model.n_obs_steps, len(vector_names(spec))
+        steps, state_size = model.n_obs_steps, len(normalization.state_mean)
         image_shape = (steps, len(spec.cameras), *spec.image_size, 3)
         # The last O observations, the seed and the control step of every environment.
         self._states = np.zeros((num_envs, steps, state_size), np.float32)
@@ -217,22 +215,23 @@ class PolicyRunner:
         # Those of a step enter the next prediction if its window of O steps reaches back to them.
         return self._buffer.steps_to_prediction(env_ids) < self._states.shape[1]
 
-    def act(self, observations: Mapping[str, NDArray[Any]], env_ids: EnvIds) -> NDArray[np.float32]:
+    def act(
+        self, vectors: NDArray[np.float32], images: NDArray[np.uint8] | None, env_ids: EnvIds
+    ) -> NDArray[np.float32]:
         """Return the next actions (b, A) in the units of the environment.
 
         Args:
-            observations: each of the spec's keys, (b, ...); images that are not needed may hold
-                anything.
+            vectors: (b, S) packed observations.
+            images: (b, N, H, W, 3); rows that are not needed may hold anything.
             env_ids: (b,) the environments that they come from.
 
         Raises:
             RequestError: the network gives numbers that are not finite.
         """
-        state = self._normalization.normalize_state(to_vector(self._spec, observations))
-        self._push(self._states, env_ids, state)
-        seen = np.flatnonzero(self.needs_images(env_ids))
-        for camera, key in enumerate(self._spec.image_keys()):
-            self._push(self._images[:, :, camera], env_ids[seen], observations[key][seen])
+        self._push(self._states, env_ids, self._normalization.normalize_state(vectors))
+        if images is not None:
+            needed = self.needs_images(env_ids)
+            self._push(self._images, env_ids[needed], images[needed])
         due = env_ids[self._buffer.steps_to_prediction(env_ids) == 0]
         size = len(self._state_tile)
         chunks = [self._predict(due[start : start + size]) for start in range(0, len(due), size)]
@@ -256,7 +255,7 @@ class PolicyRunner:
         self._state_tile[count:].zero_()
         self._state_tile.numpy()[:count] = self._states[env_ids]
         images = noise = None
-        if self._spec.cameras:
+        if self._has_images:
             self._image_tile[count:].zero_()
             self._image_tile.numpy()[:count] = self._images[env_ids]
             images = self._image_tile.to(self._device, non_blocking=True)

@@ -1,4 +1,4 @@
-"""One demonstration: a scripted expert acts in an environment, and everything is written down."""
+"""Demonstrations: a scripted expert acts in an environment, and every step is recorded."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ import atexit
 import contextlib
 import json
 import logging
-import platform
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -33,19 +30,19 @@ from robo_manip_baselines.data import (
     write_episode,
 )
 from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
-from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, world_of
-from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS, FeedingExpert
-from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase
-from robo_manip_baselines.envs.mujoco.tasks.registry import env_id, make_env
-from robo_manip_baselines.observation import FRAME_PERIOD
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import atomic_file, prepare_folder
+from robo_manip_baselines.runs.files import prepare_folder, write_json
+from robo_manip_baselines.runs.versions import software_versions
+
+SUMMARY = "summary.json"
+
+logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Demonstration:
-    """What one episode leaves behind, as ``data.write_episode`` takes it.
+class Demonstration(NamedTuple):
+    """Content of one episode file, as `write_episode` takes it.
 
     Attributes:
         arrays: field -> (T, ...) array.
@@ -64,119 +61,67 @@ def demonstrate(
     """Let an expert act through one episode.
 
     Args:
-        env: made by ``make_env``; its cameras are recorded.
-        expert: a name of ``EXPERTS``.
+        env: made by `make_env`; its cameras are recorded.
+        expert: name in the task's entry.
         seed: of the episode.
-        codec: see ``data.encode_image``.
+        codec: see `encode_image`.
         quality: of JPEG, 1 to 100.
     """
-    world = env.unwrapped
-    if not isinstance(world, FeedingEnv):
-        raise TypeError(f"the scripted experts act in FeedingEnv, not in {type(world).__name__}")
-    actor = FeedingExpert(world, EXPERTS[expert])
+    if env.spec is None:
+        raise ValueError("the environment must be made by its id, so that it can be made again")
+    world = world_of(env)
+    actor = world.task.make_expert(expert, world)
     rows: dict[str, list[Any]] = defaultdict(list)
-    images: dict[str, list[NDArray[np.uint8]]] = {
-        camera: [] for camera in world.observation_spec.cameras
-    }
-    observation, _ = env.reset(seed=seed)
-    start = world.object_pose
+    cameras = world.observation_spec.image_keys()
+    images: dict[str, list[NDArray[np.uint8]]] = {camera: [] for camera in cameras.values()}
+    observation, info = env.reset(seed=seed)
+    start = world.start_attributes()
     actor.reset()
     ended = False
     while not ended:
         action = actor.act()
-        for name, value in _row(world).items():
+        for name, value in world.episode_row().items():
             rows[name].append(value)
         rows["action"].append(action)
-        for key, camera in world.observation_spec.image_keys().items():
+        for key, camera in cameras.items():
             images[camera].append(encode_image(observation[key], codec, quality))
-        observation, _, terminated, truncated, _ = env.step(action)
-        rows["is_success"].append(world.progress.is_success)
-        rows["is_success_strict"].append(world.progress.is_success_strict)
+        observation, _, terminated, truncated, info = env.step(action)
+        rows["is_success"].append(info["is_success"])
+        rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated
+    completion_time = info["completion_time"]
     attributes = {
-        **_attributes(env, world),
+        "env_id": env.spec.id,
+        "env_kwargs": dict(env.spec.kwargs),
+        **start,
+        "is_success": info["is_success"],
+        "is_success_strict": info["is_success_strict"],
+        "completion_time": np.nan if completion_time is None else completion_time,
+        "versions": software_versions("mujoco", "numpy", "robo_manip_baselines"),
         "seed": seed,
         "expert": expert,
-        "object_initial_pose": start,
         "image_codec": codec,
         "image_quality": quality,
     }
-    return Demonstration(
-        {name: np.asarray(values) for name, values in rows.items()}, images, attributes
-    )
-
-
-def _row(world: FeedingEnv) -> dict[str, Any]:
-    """Return what is so before an action."""
-    truth = world.truth()
-    return {
-        "time": world.time,
-        "joint_position": truth.joint_position.ravel(),
-        "joint_velocity": truth.joint_velocity.ravel(),
-        "gripper_position": truth.gripper_position,
-        "gripper_velocity": truth.gripper_velocity,
-        "end_effector_position": truth.end_effector_position,
-        "end_effector_orientation": world.gripper_orientation,
-        "mouth_position": truth.mouth_position,
-        **({} if truth.predicted_mouth is None else {"predicted_mouth": truth.predicted_mouth}),
-        "head_orientation": world.head_orientation,
-        "jaw_opening": world.jaw_opening,
-        "object_pose": world.object_pose,
-        "phase": np.int8(world.progress.phase),
-        "qpos": world.data.qpos.copy(),
-        "qvel": world.data.qvel.copy(),
-    }
-
-
-def _attributes(env: gymnasium.Env[Any, Any], world: FeedingEnv) -> dict[str, Any]:
-    """Return where the episode came from and how it ended."""
-    if env.spec is None:
-        raise ValueError("the environment must be made by its id, so that it can be made again")
-    segment, progress = world.segment, world.progress
-    joints, actions = world.joint_names, world.action_names
-    return {
-        "env_id": env.spec.id,
-        "env_kwargs": dict(env.spec.kwargs),
-        "is_success": progress.is_success,
-        "is_success_strict": progress.is_success_strict,
-        "completion_time": np.nan if progress.completion_time is None else progress.completion_time,
-        "motion_clip": segment.clip,
-        "motion_subject": segment.subject,
-        "motion_start_index": segment.index,
-        "motion_start_time": segment.start / segment.fps,
-        "face_offset": world.face_offset,
-        "control_period": CONTROL_PERIOD,
-        "prediction_period": FRAME_PERIOD,
-        "phase_names": [phase.name.lower() for phase in Phase],
-        "joint_names": joints,
-        "action_names": actions,
-        "xml_hash": world.xml_hash,
-        "versions": {
-            "python": platform.python_version(),
-            "mujoco": mujoco.__version__,
-            "numpy": np.__version__,
-            "robo_manip_baselines": version("robo_manip_baselines"),
-        },
-    }
-
-
-SUMMARY = "summary.json"
-
-logger = logging.getLogger(__name__)
+    arrays = {name: np.asarray(values) for name, values in rows.items()}
+    return Demonstration(arrays, images, attributes)
 
 
 @dataclass(frozen=True)
 class Collection:
-    """What to collect, and how.
+    """Demonstrations to collect.
 
     Attributes:
-        env: name of the environment.
+        env: name of the task.
         out: folder of the demonstrations; failed episodes go to its ``failed/``.
-        expert: a name of ``EXPERTS``.
+        expert: name in the task's entry.
         seeds: of the episodes, one each.
-        env_kwargs: arguments of the environment.
+        env_kwargs: arguments of the environment; held as JSON holds them.
         codec, quality: of the images.
         workers: processes.
+
+    Raises:
+        RequestError: a value is not valid.
     """
 
     env: str
@@ -189,8 +134,8 @@ class Collection:
     workers: int = 1
 
     def __post_init__(self) -> None:
-        env_id(self.env)
-        require_choice("expert", self.expert, EXPERTS)
+        object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
+        require_choice("expert", self.expert, task_entry(self.env).experts)
         require_choice("image codec", self.codec, CODECS)
         if self.seeds.start < 0:
             raise RequestError(f"seed {self.seeds.start}: must be 0 or more")
@@ -202,18 +147,28 @@ class Collection:
         if not 1 <= self.quality <= 100:
             raise RequestError(f"image quality {self.quality}: must be 1 to 100")
 
+    def to_json(self) -> dict[str, Any]:
+        """Return what JSON can hold."""
+        return {**asdict(self), "out": str(self.out), "seeds": [self.seeds.start, self.seeds.stop]}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Collection:
+        """Return the collection that ``to_json`` was called on.
+
+        Raises:
+            RequestError: a value is not valid.
+        """
+        return cls(**{**values, "out": Path(values["out"]), "seeds": range(*values["seeds"])})
+
     def path(self, seed: int) -> Path | None:
         """Return the file of a finished seed, wherever it is; None if there is none."""
-        for success in (True, False):
-            path = episode_path(self.out, seed, success)
-            if path.is_file():
-                return path
-        return None
+        paths = (episode_path(self.out, seed, success) for success in (True, False))
+        return next((path for path in paths if path.is_file()), None)
 
 
 @dataclass(frozen=True)
-class Summary:
-    """How a collection went.
+class CollectionSummary:
+    """Summary of a collection.
 
     Attributes:
         episodes: how many there are.
@@ -234,7 +189,7 @@ class Summary:
     steps_per_second: float | None
 
 
-def collect(collection: Collection) -> Summary:
+def collect(collection: Collection) -> CollectionSummary:
     """Record every seed that has not been recorded yet, and write ``summary.json``.
 
     Killed at any moment, it leaves whole episodes only; the same call carries on from there.
@@ -244,8 +199,8 @@ def collect(collection: Collection) -> Summary:
     """
     # Everything about the request that can be wrong is found out here, before any file exists.
     with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
-        env.reset(seed=collection.seeds.start)
-        _refuse_other_settings(collection, env)
+        _require_fitting_expert(collection, env)
+        _refuse_other_settings(collection, world_of(env).xml_hash)
         prepare_folder(collection.out)
         remove_partial_episodes(collection.out)
         done = finished_seeds(collection.out)
@@ -262,18 +217,28 @@ def collect(collection: Collection) -> Summary:
                 steps += count
                 progress.update()
         elapsed = time.perf_counter() - begin
-    summary = summarise(collection, steps, steps / elapsed if todo else None)
-    _write_summary(collection, summary)
+    summary = _summarize(collection, steps, steps / elapsed if todo else None)
+    content = {
+        "env": task_entry(collection.env).env_id,
+        "env_kwargs": collection.env_kwargs,
+        "expert": collection.expert,
+        "first_seed": collection.seeds.start,
+        "workers": collection.workers,
+        **asdict(summary),
+    }
+    write_json(collection.out / SUMMARY, content)
     return summary
 
 
-def summarise(collection: Collection, steps: int, steps_per_second: float | None) -> Summary:
-    """Sum up what the files of a collection say."""
+def _summarize(
+    collection: Collection, steps: int, steps_per_second: float | None
+) -> CollectionSummary:
+    """Summarize the files of a collection."""
     outcomes = {
         seed: read_metadata(path) for seed in collection.seeds if (path := collection.path(seed))
     }
     times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
-    return Summary(
+    return CollectionSummary(
         episodes=len(outcomes),
         successes=len(times),
         strict_successes=sum(bool(o["is_success_strict"]) for o in outcomes.values()),
@@ -310,7 +275,7 @@ def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> 
         env, collection.expert, seed, codec=collection.codec, quality=collection.quality
     )
     path = episode_path(collection.out, seed, demonstration.attributes["is_success"])
-    write_episode(path, demonstration.arrays, demonstration.images, demonstration.attributes)
+    write_episode(path, *demonstration)
     return len(demonstration.arrays["time"])
 
 
@@ -330,7 +295,26 @@ def _record_in_worker(seed: int) -> int:
     return _record(_worker["collection"], _worker["env"], seed)
 
 
-def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:
+def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:
+    """Refuse an expert that does not move the arms of the environment.
+
+    Raises:
+        RequestError: its actions have another size.
+    """
+    world = world_of(env)
+    env.reset(seed=collection.seeds.start)
+    actor = world.task.make_expert(collection.expert, world)
+    actor.reset()
+    action = actor.act()
+    if action.shape != env.action_space.shape:
+        raise RequestError(
+            f"arms {world.observation_spec.arms}: the expert '{collection.expert}' gives actions "
+            f"of shape {action.shape}, {collection.env} takes {env.action_space.shape}; choose "
+            "other arms"
+        )
+
+
+def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     """Refuse to mix episodes of other settings with those that the folder holds.
 
     Raises:
@@ -344,13 +328,12 @@ def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any])
         return
     there = read_metadata(present)
     wanted = {
-        "env_id": env_id(collection.env),
-        # As JSON would give them back: tuples become lists.
-        "env_kwargs": json.loads(json.dumps(collection.env_kwargs)),
+        "env_id": task_entry(collection.env).env_id,
+        "env_kwargs": collection.env_kwargs,
         "expert": collection.expert,
         "image_codec": collection.codec,
         "image_quality": collection.quality,
-        "xml_hash": world_of(env).xml_hash,
+        "xml_hash": xml_hash,
     }
     for name, value in wanted.items():
         if there[name] != value:
@@ -358,16 +341,3 @@ def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any])
                 f"'{collection.out}' holds episodes with {name} {there[name]}, not {value}; "
                 "give another --out or remove that folder"
             )
-
-
-def _write_summary(collection: Collection, summary: Summary) -> None:
-    content = {
-        "env": env_id(collection.env),
-        "env_kwargs": collection.env_kwargs,
-        "expert": collection.expert,
-        "first_seed": collection.seeds.start,
-        "workers": collection.workers,
-        **asdict(summary),
-    }
-    with atomic_file(collection.out / SUMMARY) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

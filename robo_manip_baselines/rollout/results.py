@@ -1,4 +1,8 @@
-"""What one evaluation episode came to: a line of ``results.jsonl``."""
+"""Results of evaluation episodes: rows of ``results.jsonl``, the folder that holds them, a summary.
+
+Killed at any moment, a run leaves complete rows and at most one torn one at the end, which is
+dropped when the run continues.
+"""
 
 from __future__ import annotations
 
@@ -8,44 +12,50 @@ import types
 import typing
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
 
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import APPROACH_LIMIT, FAILURES
+from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn, TaskEntry, task_entry
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file, prepare_folder
+from robo_manip_baselines.runs.files import prepare_folder, read_json, write_json, write_text
+from robo_manip_baselines.runs.progress import closing_table
 
-Offset = tuple[float, float, float]
+ROW_VERSION = 2
+"""of a row; version 1 named the condition ``arm`` and did not hold the observation spec."""
+
+SCHEMA = "robo_manip_baselines/evaluation"
+SCHEMA_VERSION = 1
+
+RESULTS = "results.jsonl"
+MANIFEST = "evaluation.json"
+SUMMARY = "summary.json"
+
+CONFIDENCE = 0.95
+"""of all intervals."""
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """One episode, SI units, world frame.
+    """Result of one episode: a row of ``results.jsonl``. SI units, world frame.
 
     Attributes:
-        env: name of the environment
+        env: name of the task
         seed: of the episode
-        is_success: the gripper brought the cube within 0.03, 0.01 and 0.01 m of the mouth
-        is_success_strict: and let go of it inside the mouth, without touching the face
-        completion_time: s from the lift to success; null without success
-        time_since_lift: s from the lift to the end of the episode; null without a lift
+        is_success: the task's condition was met
+        is_success_strict: and its strict condition
+        completion_time: s to success, as the task counts it; null without success
         steps: control steps of 0.02 s
         failure: kind of failure; empty for a success
-        closest_distance: m, smallest distance gripper-mouth while the lifted cube was held; null
-            without a lift
-        closest_offset: m, x, y, z of gripper minus mouth at the closest approach with the cube,
-            nearest in units of the tolerances; null without a lift
-        cube_offset: m, cube minus mouth in the face's axes (out, across to the person's left, up)
-            where the lifted cube was held and its centre nearest to the mouth; null without a lift
-        face_force: N, largest normal force between robot and face
         motion_clip: recorded clip whose motion the face replayed
         motion_subject: person in that clip
+        columns: columns of the task, see its entry
         policy: name of the policy
-        arm: experimental arm: what the policy was shown, for example current_pred_h2
+        condition: name of the experimental condition, for example current_pred_h2
+        observation: spec of what the policy was shown, as JSON; null in rows of version 1
         train_seed: seed of the training run; null for a policy that was not trained
         checkpoint: hash of the checkpoint's contents
         versions: of the software
@@ -56,96 +66,124 @@ class EpisodeResult:
     is_success: bool
     is_success_strict: bool
     completion_time: float | None
-    time_since_lift: float | None
     steps: int
     failure: str
-    closest_distance: float | None
-    closest_offset: Offset | None
-    cube_offset: Offset | None
-    face_force: float
     motion_clip: str
     motion_subject: str
+    columns: dict[str, Any] = field(default_factory=dict)
     policy: str = ""
-    arm: str = ""
+    condition: str = ""
+    observation: dict[str, Any] | None = None
     train_seed: int | None = None
     checkpoint: str = ""
     versions: dict[str, str] = field(default_factory=dict)
 
     def to_line(self) -> str:
-        """Return it as one line of JSON, without the line's end."""
-        return json.dumps(asdict(self), allow_nan=False)
+        """Return the row as one line of JSON, without the line's end."""
+        values = asdict(self)
+        columns = values.pop("columns")
+        return json.dumps({"version": ROW_VERSION, **values, **columns}, allow_nan=False)
 
     @classmethod
     def from_line(cls, line: str) -> EpisodeResult:
-        """Read what ``to_line`` wrote.
+        """Read a row of this version or of version 1.
 
         Raises:
-            ValueError: it is no such line; the message says what is wrong with it.
+            ValueError: it is no such row; the message says what is wrong with it.
         """
         values = json.loads(line)
         if not isinstance(values, dict):
             raise ValueError("it is no JSON object")
+        version = values.pop("version", 1)
+        if version == 1:
+            values.setdefault("observation", None)
+            if "arm" in values:
+                values["condition"] = values.pop("arm")
+        elif version != ROW_VERSION:
+            raise ValueError(f"'version' is {version}; this release reads 1 and {ROW_VERSION}")
         hints = typing.get_type_hints(cls)
-        names = [item.name for item in fields(cls)]
-        for name in names:
-            if name not in values:
-                raise ValueError(f"'{name}' is missing")
-            if not _fits(values[name], hints[name]):
-                raise ValueError(f"'{name}' is {json.dumps(values[name])}")
-        if unknown := sorted(set(values) - set(names)):
+        hints.pop("columns")
+        given = {name: _checked(values, name, hint) for name, hint in hints.items()}
+        task = task_entry(given["env"])
+        columns = {c.name: _checked(values, c.name, _hint_of(c)) for c in task.columns}
+        if unknown := sorted(set(values) - set(given) - set(columns)):
             raise ValueError(f"'{unknown[0]}' is unknown")
-        if values["failure"] and values["failure"] not in FAILURES:
-            raise ValueError(f"'failure' is {json.dumps(values['failure'])}")
-        for name in ("closest_offset", "cube_offset"):
-            if values[name] is not None:
-                values[name] = tuple(values[name])
-        return cls(**values)
+        if given["failure"] and given["failure"] not in task.failures:
+            raise ValueError(f"'failure' is {json.dumps(given['failure'])}")
+        return cls(**given, columns={k: _with_tuples(v) for k, v in columns.items()})
+
+
+Vector = tuple[float, float, float]
+
+
+def _hint_of(column: ResultColumn) -> Any:
+    kind: Any = Vector if column.kind == "vector" else float
+    return kind | None if column.is_optional else kind
+
+
+def _checked(values: dict[str, Any], name: str, hint: Any) -> Any:
+    if name not in values:
+        raise ValueError(f"'{name}' is missing")
+    if not _fits(values[name], hint):
+        raise ValueError(f"'{name}' is {json.dumps(values[name])}")
+    return values[name]
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a JSON value is of the declared type."""
+    """Return whether a JSON value is of the declared type."""
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
         return any(_fits(value, part) for part in typing.get_args(hint))
     if hint is float:
         return isinstance(value, float | int) and not isinstance(value, bool)
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
-    if hint == Offset:
+    if hint == Vector:
         return isinstance(value, list) and len(value) == 3 and all(_fits(v, float) for v in value)
     if typing.get_origin(hint) is dict:
-        return isinstance(value, dict) and all(isinstance(v, str) for v in value.values())
+        is_text = typing.get_args(hint)[1] is str
+        return isinstance(value, dict) and all(
+            isinstance(v, str) or not is_text for v in value.values()
+        )
     return isinstance(value, hint)
 
 
-SCHEMA = "robo_manip_baselines/evaluation"
-SCHEMA_VERSION = 1
-
-RESULTS = "results.jsonl"
-MANIFEST = "evaluation.json"
+def _with_tuples(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
 
 
-def read_results(folder: str | Path) -> list[EpisodeResult]:
-    """Read the results of a folder by seed; a torn last line is left out.
+def read_rows(path: Path) -> list[EpisodeResult]:
+    """Read the rows of a results file in their order; a torn last row is left out.
 
     Raises:
-        RequestError: there are none, or a line is damaged.
+        RequestError: the file cannot be read, or a row is damaged.
     """
-    path = Path(folder) / RESULTS
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise RequestError(
-            f"'{path}' cannot be read: {error.strerror}; name a folder that Rollout.py wrote"
+            f"'{path}' cannot be read: {error.strerror}; name a results.jsonl file"
         ) from error
-    found: dict[int, EpisodeResult] = {}
+    rows = []
     for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
         try:
-            result = EpisodeResult.from_line(line)
+            rows.append(EpisodeResult.from_line(line))
         except ValueError as error:
             raise RequestError(
                 f"'{path}', line {number} is damaged: {error}; remove that line, and its episode "
                 "is done again"
             ) from error
+    return rows
+
+
+def read_results(folder: str | Path) -> list[EpisodeResult]:
+    """Read the results of an evaluation folder by seed.
+
+    Raises:
+        RequestError: there are none, a row is damaged, or a seed is there twice.
+    """
+    path = Path(folder) / RESULTS
+    found: dict[int, EpisodeResult] = {}
+    for result in read_rows(path):
         if result.seed in found:
             raise RequestError(f"'{path}' has two lines for seed {result.seed}; remove one")
         found[result.seed] = result
@@ -156,9 +194,9 @@ class ResultsFile:
     """Results of one evaluation, appended as episodes end. Use as a context manager.
 
     Args:
-        folder: made if need be.
-        settings: what must be the same for all episodes of the folder, ready for JSON.
-        facts: what else to note, ready for JSON.
+        folder: created if need be.
+        settings: what all episodes of the folder must share, ready for JSON.
+        facts: further facts to record, ready for JSON.
 
     Attributes:
         done: results that the folder already holds, by seed.
@@ -174,7 +212,7 @@ class ResultsFile:
         prepare_folder(folder)
         if not (folder / MANIFEST).exists():
             content = {"schema": SCHEMA, "version": SCHEMA_VERSION, "settings": settings, **facts}
-            _write(folder / MANIFEST, json.dumps(content, indent=2) + "\n")
+            write_json(folder / MANIFEST, content)
         self._file: TextIO | None = None
 
     def __enter__(self) -> ResultsFile:
@@ -192,10 +230,11 @@ class ResultsFile:
             self._file.close()
             self._file = None
         if exc_type is None:
-            _write(self._path, "".join(f"{r.to_line()}\n" for r in self.of(sorted(self.done))))
+            rows = self.of(sorted(self.done))
+            write_text(self._path, "".join(f"{row.to_line()}\n" for row in rows))
 
     def append(self, result: EpisodeResult) -> None:
-        """Write a line; it is on the disk when this returns."""
+        """Write a row; it is on the disk when this returns."""
         if self._file is None:
             raise ValueError("open it with a with statement before appending")
         self._file.write(result.to_line() + "\n")
@@ -215,9 +254,9 @@ def _refuse_other_settings(folder: Path, settings: dict[str, Any]) -> None:
             raise RequestError(f"'{folder}' holds {RESULTS} without {MANIFEST}; give another --out")
         return
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         schema, version, there = content["schema"], content["version"], content["settings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (RequestError, KeyError) as error:
         raise RequestError(f"'{path}' is damaged; give another --out") from error
     if (schema, version) != (SCHEMA, SCHEMA_VERSION):
         raise RequestError(
@@ -235,7 +274,6 @@ def _refuse_other_settings(folder: Path, settings: dict[str, Any]) -> None:
 
 
 def _drop_torn_line(path: Path) -> None:
-    """Cut off what follows the last end of a line."""
     if not path.exists():
         return
     content = path.read_bytes()
@@ -244,24 +282,13 @@ def _drop_torn_line(path: Path) -> None:
         os.truncate(path, whole)
 
 
-def _write(path: Path, text: str) -> None:
-    with atomic_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-SUMMARY = "summary.json"
-
-CONFIDENCE = 0.95
-"""of all intervals."""
-
-
 @dataclass(frozen=True)
-class Share:
-    """How many of all, with the Wilson interval of the proportion.
+class Proportion:
+    """Count and proportion, with the Wilson interval.
 
     Attributes:
-        count: of these.
-        rate: share of all; None without any.
+        count: of the episodes in question.
+        rate: of all episodes; None without any.
         low, high: ends of the 95 % interval; None without any.
     """
 
@@ -270,6 +297,16 @@ class Share:
     low: float | None
     high: float | None
 
+    @classmethod
+    def of(cls, count: int, total: int) -> Proportion:
+        """Return the proportion of ``count`` in ``total``."""
+        if not total:
+            return cls(count, None, None, None)
+        from statsmodels.stats.proportion import proportion_confint  # slow to import
+
+        ends: Any = proportion_confint(count, total, alpha=1.0 - CONFIDENCE, method="wilson")
+        return cls(count, count / total, float(ends[0]), float(ends[1]))
+
     def __str__(self) -> str:
         if self.rate is None or self.low is None or self.high is None:
             return "-"
@@ -277,106 +314,103 @@ class Share:
 
 
 @dataclass(frozen=True)
-class Summary:
-    """How an evaluation went.
+class EvaluationSummary:
+    """Summary of an evaluation.
 
     Attributes:
         episodes: how many there are.
-        success, strict_success: shares of ``is_success`` and ``is_success_strict``.
-        success_within_limit: share of successes within 6 s of the lift (Algorithm 1).
+        success, strict_success: proportions of ``is_success`` and ``is_success_strict``.
+        success_within_limit: proportion of successes within the task's time limit for success;
+            None where it has none.
         completion_time_mean, completion_time_sd: s, over successes; None without enough of them.
-        closest_distance_median: m, over episodes with a lift; None without any.
-        face_force_max: N; None without episodes.
-        failures: kind -> how many.
+        columns: column of the task -> median and maximum over the episodes that have it.
+        failures: kind -> count.
         failed_seeds: seeds of the episodes that failed.
-        seconds: that this run took.
+        seconds: of this run.
         episodes_per_second: of this run; None if nothing was left to do.
     """
 
     episodes: int
-    success: Share
-    strict_success: Share
-    success_within_limit: Share
+    success: Proportion
+    strict_success: Proportion
+    success_within_limit: Proportion | None
     completion_time_mean: float | None
     completion_time_sd: float | None
-    closest_distance_median: float | None
-    face_force_max: float | None
+    columns: dict[str, dict[str, float]]
     failures: dict[str, int]
     failed_seeds: list[int]
     seconds: float
     episodes_per_second: float | None
 
 
-def share(count: int, total: int) -> Share:
-    """Return a count as a share of a total, with its Wilson interval."""
-    if not total:
-        return Share(count, None, None, None)
-    from statsmodels.stats.proportion import proportion_confint  # slow to import
-
-    ends: Any = proportion_confint(count, total, alpha=1.0 - CONFIDENCE, method="wilson")
-    return Share(count, count / total, float(ends[0]), float(ends[1]))
-
-
-def summarise(results: Sequence[EpisodeResult], *, new: int, seconds: float) -> Summary:
-    """Sum up results.
+def summarize(
+    task: TaskEntry, results: Sequence[EpisodeResult], *, new: int, seconds: float
+) -> EvaluationSummary:
+    """Summarize the results of all episodes.
 
     Args:
+        task: that they are of.
         results: of all episodes.
-        new: how many of them this run made.
-        seconds: that this run took.
+        new: number of them that this run made.
+        seconds: of this run.
     """
-    total = len(results)
+    total, limit = len(results), task.success_time_limit
     times = [r.completion_time for r in results if r.completion_time is not None]
-    distances = [r.closest_distance for r in results if r.closest_distance is not None]
     kinds = Counter(r.failure for r in results)
-    return Summary(
+    columns = {}
+    for column in task.columns:
+        values = [r.columns[column.name] for r in results]
+        found = [value for value in values if value is not None]
+        if column.kind == "float" and found:
+            columns[column.name] = {"median": float(np.median(found)), "max": max(found)}
+    return EvaluationSummary(
         episodes=total,
-        success=share(sum(r.is_success for r in results), total),
-        strict_success=share(sum(r.is_success_strict for r in results), total),
+        success=Proportion.of(sum(r.is_success for r in results), total),
+        strict_success=Proportion.of(sum(r.is_success_strict for r in results), total),
         # Times are whole control steps; the limit itself is within.
-        success_within_limit=share(sum(t <= APPROACH_LIMIT for t in times), total),
+        success_within_limit=None
+        if limit is None
+        else Proportion.of(sum(t <= limit for t in times), total),
         completion_time_mean=float(np.mean(times)) if times else None,
         completion_time_sd=float(np.std(times, ddof=1)) if len(times) > 1 else None,
-        closest_distance_median=float(np.median(distances)) if distances else None,
-        face_force_max=max((r.face_force for r in results), default=None),
-        failures={kind: kinds[kind] for kind in FAILURES},
+        columns=columns,
+        failures={kind: kinds[kind] for kind in task.failures},
         failed_seeds=[r.seed for r in results if not r.is_success],
         seconds=seconds,
         episodes_per_second=new / seconds if new else None,
     )
 
 
-def write_summary(folder: Path, summary: Summary, facts: dict[str, Any]) -> None:
-    """Write ``summary.json``: the facts, then the summary."""
-    with atomic_file(folder / SUMMARY) as temporary:
-        content = {**facts, **asdict(summary)}
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
-def table(summary: Summary, facts: dict[str, str]) -> str:
-    """Lay out the closing table; further rows, ready to print, go below."""
-    mean, spread = summary.completion_time_mean, summary.completion_time_sd
-    total = summary.episodes
+def summary_table(task: TaskEntry, summary: EvaluationSummary, facts: dict[str, str]) -> str:
+    """Lay out the closing table; ``facts`` are further rows at its end."""
+    total, limit = summary.episodes, summary.success_within_limit
     failures = [f"{kind} {count}" for kind, count in summary.failures.items() if count]
-    distance, force = summary.closest_distance_median, summary.face_force_max
     rate = summary.episodes_per_second
+
+    def proportion(part: Proportion) -> str:
+        return f"{part.count}/{total}  {part}"
+
     rows = {
         "episodes": str(total),
-        "success": _count(summary.success, total),
-        "strict success": _count(summary.strict_success, total),
-        f"success in {APPROACH_LIMIT:g} s": _count(summary.success_within_limit, total),
-        "completion time": "-"
-        if mean is None
-        else f"{mean:.2f}" + (f" ± {spread:.2f} s" if spread is not None else " s"),
-        "closest approach": "-" if distance is None else f"{1000 * distance:.1f} mm (median)",
-        "largest face force": "-" if force is None else f"{force:.1f} N",
+        "success": proportion(summary.success),
+        "strict success": proportion(summary.strict_success),
+    }
+    if limit:
+        rows[f"success in {task.success_time_limit:g} s"] = proportion(limit)
+    rows["completion time"] = mean_and_sd(summary.completion_time_mean, summary.completion_time_sd)
+    for name, values in summary.columns.items():
+        label = name.replace("_", " ")
+        rows[label] = f"{values['median']:.4g} (median), {values['max']:.4g} (max)"
+    rows |= {
         "failures": ", ".join(failures) or "-",
         "speed": "-" if rate is None else f"{rate:.2f} episodes/s",
         **facts,
     }
-    width = max(map(len, rows))
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+    return closing_table(rows)
 
 
-def _count(part: Share, total: int) -> str:
-    return f"{part.count}/{total}  {part}"
+def mean_and_sd(mean: float | None, sd: float | None) -> str:
+    """Format a mean time with its standard deviation: ``5.69 ± 0.96 s``."""
+    if mean is None:
+        return "-"
+    return f"{mean:.2f}" + (f" ± {sd:.2f} s" if sd is not None else " s")

@@ -1,47 +1,56 @@
-"""Letting a policy act through episodes, many at once.
+"""A policy acting through episodes, many at once.
 
-Legend: n slots, b slots that act now, T steps of an episode, S elements of the state, A elements
-of an action.
+Legend: n environments, b of them that act now, T steps of an episode, S elements of the packed
+observation, A elements of an action, N cameras, H and W image height and width.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.rollout.results import EpisodeResult
-from robo_manip_baselines.rollout.workers import Environments, Order, split_vector
+from robo_manip_baselines.rollout.workers import EnvPool, StepRequest
+
+EnvIds = NDArray[np.intp]
+"""(b,) numbers of environments, none of them twice."""
 
 
-class Policy(Protocol):
-    """What acts. Slots are numbers of episodes that run at once, none of them twice in a call."""
+class ActingPolicy(Protocol):
+    """Policy that acts in several environments at once."""
 
-    def reset(self, env_ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
-        """Start episodes of these seeds in these environments."""
+    def reset(self, env_ids: EnvIds, seeds: Sequence[int]) -> None:
+        """Start the episodes of these seeds in these environments."""
         ...
 
-    def needs_images(self, env_ids: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return (b,) whether the images of each environment's next observation are needed."""
+    def needs_images(self, env_ids: EnvIds) -> NDArray[np.bool_]:
+        """Return, (b,), whether the policy reads the images when it acts next."""
         ...
 
     def act(
-        self, observations: Mapping[str, NDArray[Any]], env_ids: NDArray[np.intp]
+        self, vectors: NDArray[np.float32], images: NDArray[np.uint8] | None, env_ids: EnvIds
     ) -> NDArray[np.float32]:
-        """Return the next actions (b, A), each from its own row of observations (b, ...) alone."""
+        """Return the next actions (b, A), each from its own row of the observations alone.
+
+        Args:
+            vectors: (b, S) packed observations.
+            images: (b, N, H, W, 3); None without cameras. Rows that need none may hold anything.
+            env_ids: (b,) environments that they come from.
+        """
         ...
 
 
 @dataclass
 class Recording:
-    """What a policy saw, images apart, and did in an episode; it can be acted out again.
+    """Observations, images apart, and actions of an episode; it can be replayed.
 
     Attributes:
-        vectors: T times (S,) float32, all vectors of the observation joined.
+        vectors: T times (S,) float32, packed observations.
         actions: T times (A,) float32.
     """
 
@@ -50,20 +59,21 @@ class Recording:
 
 
 def rollout(
-    policy: Policy,
-    environments: Environments,
+    policy: ActingPolicy,
+    envs: EnvPool,
     seeds: Sequence[int],
     *,
     on_episode: Callable[[EpisodeResult, Recording], None] | None = None,
 ) -> list[EpisodeResult]:
     """Let a policy act through one episode for each seed.
 
-    A slot whose episode has ended starts the next seed at once. What an episode comes to depends on
-    its seed alone, if the policy makes each row of actions from its own row of observations.
+    An environment whose episode has ended starts the next seed at once. The result of an episode
+    depends on its seed alone, if the policy makes each row of actions from its own row of
+    observations.
 
     Args:
-        policy: has as many slots as the environments.
-        environments: from ``open_environments``.
+        policy: for as many environments.
+        envs: from ``open_envs``.
         seeds: of the episodes, none of them twice.
         on_episode: called with every episode that has ended, in the order in which they end.
 
@@ -76,51 +86,51 @@ def rollout(
     """
     if len(set(seeds)) != len(seeds):
         raise ValueError("every seed may be there once")
-    arrays, waiting = environments.arrays, deque(seeds)
+    arrays, waiting = envs.arrays, deque(seeds)
+    has_images = bool(envs.config.spec.cameras)
     recordings: dict[int, Recording] = {}
     results: dict[int, EpisodeResult] = {}
 
-    def start(slots: Sequence[int]) -> list[Order]:
-        """Start the next seeds in these slots, as long as there are any."""
-        used = slots[: len(waiting)]
+    def start(numbers: Sequence[int]) -> list[StepRequest]:
+        """Start the next seeds in these environments, as long as there are any."""
+        used = list(numbers[: len(waiting)])
         if not used:
             return []
-        numbers = np.array(used, dtype=np.intp)
-        begun = [waiting.popleft() for _ in used]
-        policy.reset(numbers, begun)
-        recordings.update((slot, Recording()) for slot in used)
-        looks = policy.needs_images(numbers).tolist()
-        return [Order(*order) for order in zip(used, begun, looks, strict=True)]
+        started = [waiting.popleft() for _ in used]
+        env_ids = np.array(used, dtype=np.intp)
+        policy.reset(env_ids, started)
+        recordings.update((number, Recording()) for number in used)
+        needs = policy.needs_images(env_ids).tolist()
+        return [StepRequest(*request) for request in zip(used, started, needs, strict=True)]
 
-    def act(slots: list[int]) -> list[Order]:
-        """Let the policy act in these slots."""
-        if not slots:
+    def act(numbers: list[int]) -> list[StepRequest]:
+        """Let the policy act in these environments."""
+        if not numbers:
             return []
-        numbers = np.array(slots, dtype=np.intp)
-        vectors = arrays.vectors[numbers]
-        observations: dict[str, NDArray[Any]] = {**split_vector(environments.task.spec, vectors)}
-        for camera, key in enumerate(environments.task.spec.image_keys()):
-            observations[key] = arrays.images[numbers, camera]
-        actions = policy.act(observations, numbers)
-        arrays.actions[numbers] = actions
-        for slot, vector, action in zip(slots, vectors, actions, strict=True):
-            recordings[slot].vectors.append(vector)
-            recordings[slot].actions.append(action)
-        looks = policy.needs_images(numbers).tolist()
-        return [Order(slot, None, look) for slot, look in zip(slots, looks, strict=True)]
+        env_ids = np.array(numbers, dtype=np.intp)
+        vectors = arrays.vectors[env_ids]
+        actions = policy.act(vectors, arrays.images[env_ids] if has_images else None, env_ids)
+        arrays.actions[env_ids] = actions
+        for number, vector, action in zip(numbers, vectors, actions, strict=True):
+            recordings[number].vectors.append(vector)
+            recordings[number].actions.append(action)
+        needs = policy.needs_images(env_ids).tolist()
+        return [
+            StepRequest(number, None, need) for number, need in zip(numbers, needs, strict=True)
+        ]
 
-    orders, running = start(range(arrays.slots)), 0
-    while orders or running:
-        environments.submit(orders)
-        running += len(orders)
-        events = environments.wait()
-        running -= len(events)
-        for slot, result in events:
+    requests, running = start(range(arrays.num_envs)), 0
+    while requests or running:
+        envs.submit(requests)
+        running += len(requests)
+        answers = envs.wait()
+        running -= len(answers)
+        for number, result in answers:
             if result is not None:
                 results[result.seed] = result
                 if on_episode:
-                    on_episode(result, recordings[slot])
-        ready = sorted(slot for slot, result in events if result is None)
-        ended = sorted(slot for slot, result in events if result is not None)
-        orders = act(ready) + start(ended)
+                    on_episode(result, recordings[number])
+        ready = sorted(number for number, result in answers if result is None)
+        ended = sorted(number for number, result in answers if result is not None)
+        requests = act(ready) + start(ended)
     return [results[seed] for seed in seeds]

@@ -1,4 +1,14 @@
-"""The environment in which a policy is evaluated, as something that can be sent to a process."""
+"""Environments that run beside one another, in this process or in workers.
+
+Step requests go to environments, and a step result comes back for each. Observations, actions and
+images lie in memory that all processes share. It has no name: a file in ``/dev/shm`` (or in the
+temporary folder, where that is too small) that is deleted as soon as it is open and handed to the
+workers as it is, so that nothing can be left behind, however a run ends. What goes through the
+pipes is small: requests, and results of episodes.
+
+Legend: n environments, S elements of the packed observation, A elements of an action, N cameras, H
+and W image height and width.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +17,7 @@ import multiprocessing
 import signal
 import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -15,24 +25,31 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.vx300s import ARM_JOINTS
-from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
-from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import EpisodeWatch
-from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
-from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.state import to_vector, vector_names
+from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    EpisodeMetrics,
+    TaskEntry,
+    make_env,
+    task_entry,
+)
+from robo_manip_baselines.observation import ARM_JOINTS, ObservationSpec
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.errors import RequestError
 
+_PATIENCE = 5.0
+"""s for a worker to end by itself, when the run is over, before it is killed."""
+
+_ALIGNMENT = 64
+"""bytes; a cache line, so that no two arrays share one."""
+
 
 @dataclass(frozen=True)
-class Task:
-    """An environment and what a policy is shown there.
+class EnvConfig:
+    """Environment in which a policy acts; can be sent to a process.
 
     Attributes:
-        env: name of the environment.
+        env: name of the task.
         spec: what the policy is shown.
         env_kwargs: further arguments of the environment, such as ``face_motion``.
     """
@@ -42,9 +59,14 @@ class Task:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def task(self) -> TaskEntry:
+        """Entry of the task."""
+        return task_entry(self.env)
+
+    @property
     def vector_size(self) -> int:
         """S, elements of all vectors together."""
-        return len(vector_names(self.spec))
+        return len(self.spec.vector_names(self.task.names))
 
     @property
     def action_size(self) -> int:
@@ -57,7 +79,7 @@ class Task:
         return (len(self.spec.cameras), *self.spec.image_size, 3)
 
     def make(self, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """Make the environment, without cameras: whoever wants a view renders it.
+        """Make the environment.
 
         Args:
             **changes: arguments that shall differ.
@@ -65,128 +87,113 @@ class Task:
         Raises:
             RequestError: an argument is not valid.
         """
-        spec = self.spec
-        arguments = {
-            "obs": spec.obs,
-            "horizon": spec.horizon,
-            "cameras": (),
-            "image_size": spec.image_size,
-            "object_pose": spec.object_pose,
-            "arms": spec.arms,
-            "corruption": spec.corruption and asdict(spec.corruption),
-            **self.env_kwargs,
-            **changes,
-        }
-        return make_env(self.env, **arguments)
+        return make_env(self.env, **{**self.spec.env_kwargs(), **self.env_kwargs, **changes})
 
 
-_ALIGNMENT = 64
-"""bytes; a cache line, so that no two arrays share one."""
-
-
-class Order(NamedTuple):
-    """What a slot shall do.
+class StepRequest(NamedTuple):
+    """Request to an environment.
 
     Attributes:
-        slot: its number.
-        seed: of the episode to start; None to take one step with the slot's action.
-        looks: whether the policy will look at the cameras afterwards.
+        env_id: number of the environment.
+        seed: of the episode to start; None to take one step with the environment's action.
+        needs_images: whether the policy will read the images afterwards.
     """
 
-    slot: int
+    env_id: int
     seed: int | None
-    looks: bool
+    needs_images: bool
 
 
-class Event(NamedTuple):
-    """A slot has done what it was ordered to.
+class StepResult(NamedTuple):
+    """Answer to a request.
 
     Attributes:
-        slot: its number.
-        result: what the episode came to, if it ended.
+        env_id: number of the environment.
+        result: of the episode, if it has ended.
     """
 
-    slot: int
+    env_id: int
     result: EpisodeResult | None
 
 
-class Environments(Protocol):
-    """Slots, wherever they run."""
-
-    @property
-    def task(self) -> Task:
-        """The environment of every slot."""
-        ...
-
-    @property
-    def arrays(self) -> SlotArrays:
-        """What goes in and comes out."""
-        ...
-
-    def submit(self, orders: Sequence[Order]) -> None:
-        """Give orders to slots that have none."""
-        ...
-
-    def wait(self) -> list[Event]:
-        """Wait until some slots are done, and say which."""
-        ...
-
-
-class SlotArrays:
-    """One row for each slot, laid out in one stretch of memory.
+class SharedArrays:
+    """One row for each environment, laid out in one stretch of memory.
 
     Args:
-        task: says the sizes.
-        slots: n.
+        config: decides the sizes.
+        num_envs: n.
         buffer: of ``size`` bytes, zeros; made here if None.
 
     Attributes:
-        vectors: (n, S) float32, all vectors of the observation joined.
+        vectors: (n, S) float32, packed observations.
         actions: (n, A) float32, the next action.
         images: (n, N, H, W, 3) uint8.
     """
 
-    def __init__(self, task: Task, slots: int, buffer: Any = None) -> None:
-        memory = bytearray(self.size(task, slots)) if buffer is None else buffer
+    def __init__(self, config: EnvConfig, num_envs: int, buffer: Any = None) -> None:
+        memory = bytearray(self.size(config, num_envs)) if buffer is None else buffer
         parts, start = [], 0
-        for shape, kind in _layout(task, slots):
+        for shape, kind in _layout(config, num_envs):
             count = int(np.prod(shape))
             parts.append(np.frombuffer(memory, kind, count, start).reshape(shape))
             start += _padded(count * np.dtype(kind).itemsize)
         self.vectors, self.actions, self.images = parts
-        self.slots = slots
+        self.num_envs = num_envs
 
     @staticmethod
-    def size(task: Task, slots: int) -> int:
+    def size(config: EnvConfig, num_envs: int) -> int:
         """Bytes that the arrays need."""
         return sum(
             _padded(int(np.prod(shape)) * np.dtype(kind).itemsize)
-            for shape, kind in _layout(task, slots)
+            for shape, kind in _layout(config, num_envs)
         )
 
 
-class SlotEnvironments:
-    """The environments of some slots, in this process; made when first needed.
+class EnvPool(Protocol):
+    """Environments, wherever they run."""
+
+    @property
+    def config(self) -> EnvConfig:
+        """Configuration of every environment."""
+        ...
+
+    @property
+    def arrays(self) -> SharedArrays:
+        """Inputs and outputs."""
+        ...
+
+    def submit(self, requests: Sequence[StepRequest]) -> None:
+        """Send requests to environments that have none."""
+        ...
+
+    def wait(self) -> list[StepResult]:
+        """Wait until some environments have answered, and return the answers."""
+        ...
+
+
+class LocalEnvs:
+    """Environments in this process; made when first needed.
 
     Args:
-        task: the environment of every slot.
-        arrays: rows of these slots, and of others.
+        config: of every environment.
+        arrays: rows of these environments, and of others.
     """
 
-    def __init__(self, task: Task, arrays: SlotArrays) -> None:
-        self.task, self.arrays = task, arrays
+    def __init__(self, config: EnvConfig, arrays: SharedArrays) -> None:
+        self.config, self.arrays = config, arrays
         self._envs: dict[int, gymnasium.Env[Any, Any]] = {}
-        self._watches: dict[int, EpisodeWatch] = {}
-        self._events: list[Event] = []
+        self._metrics: dict[int, EpisodeMetrics] = {}
+        self._seeds: dict[int, int] = {}
+        self._answers: list[StepResult] = []
 
-    def submit(self, orders: Sequence[Order]) -> None:
-        """Carry out the orders."""
-        self._events += [self._carry_out(order) for order in orders]
+    def submit(self, requests: Sequence[StepRequest]) -> None:
+        """Carry out the requests."""
+        self._answers += [self._carry_out(request) for request in requests]
 
-    def wait(self) -> list[Event]:
-        """Return what has been done."""
-        events, self._events = self._events, []
-        return events
+    def wait(self) -> list[StepResult]:
+        """Return the answers."""
+        answers, self._answers = self._answers, []
+        return answers
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
@@ -194,62 +201,56 @@ class SlotEnvironments:
             env.close()
         self._envs.clear()
 
-    def _carry_out(self, order: Order) -> Event:
-        slot, task = order.slot, self.task
-        if order.seed is None:
-            env, watch = self._envs[slot], self._watches[slot]
-            observation, _, terminated, truncated, info = env.step(self.arrays.actions[slot])
-            watch.see(info)
+    def _carry_out(self, request: StepRequest) -> StepResult:
+        number, seed, needs_images = request
+        if number not in self._envs:
+            self._envs[number] = self.config.make()
+        env = self._envs[number]
+        world = world_of(env)
+        world.renders_images = needs_images
+        if seed is None:
+            observation, _, terminated, truncated, info = env.step(self.arrays.actions[number])
+            metrics = self._metrics[number]
+            metrics.update(info)
             if terminated or truncated:
-                return Event(slot, watch.result(info))
+                return StepResult(number, self._result(world, self._seeds[number], metrics, info))
         else:
-            env = self._envs.get(slot)
-            if env is None:
-                env = self._envs[slot] = task.make()
-            observation, _ = env.reset(seed=order.seed)
-            segment = world_of(env).segment
-            self._watches[slot] = EpisodeWatch(task.env, order.seed, segment.clip, segment.subject)
-        self.arrays.vectors[slot] = to_vector(task.spec, observation)
-        if order.looks and task.spec.cameras:
-            world = world_of(env)
-            views = world.renderer.render(world.data, task.spec.cameras)
-            for camera, view in enumerate(views.values()):
-                self.arrays.images[slot, camera] = view
-        return Event(slot, None)
+            observation, _ = env.reset(seed=seed)
+            self._metrics[number] = self.config.task.make_metrics()
+            self._seeds[number] = seed
+        self.arrays.vectors[number] = world.vector
+        if needs_images:
+            for camera, key in enumerate(self.config.spec.image_keys()):
+                self.arrays.images[number, camera] = observation[key]
+        return StepResult(number, None)
 
-
-def _layout(task: Task, slots: int) -> list[tuple[tuple[int, ...], Any]]:
-    return [
-        ((slots, task.vector_size), np.float32),
-        ((slots, task.action_size), np.float32),
-        ((slots, *task.image_shape), np.uint8),
-    ]
-
-
-def _padded(size: int) -> int:
-    return -(-size // _ALIGNMENT) * _ALIGNMENT
-
-
-def split_vector(
-    spec: ObservationSpec, vector: NDArray[np.float32]
-) -> dict[str, NDArray[np.float32]]:
-    """Take a joined vector (..., S) apart into the vectors of the observation (..., n)."""
-    components = spec.components()
-    ends = np.cumsum([len(names) for names in components.values()])
-    return dict(zip(components, np.split(vector, ends[:-1], axis=-1), strict=True))
-
-
-_PATIENCE = 5.0
-"""s for a worker to end by itself, when the run is over, before it is killed."""
+    def _result(
+        self, world: FaceEnv, seed: int, metrics: EpisodeMetrics, info: dict[str, Any]
+    ) -> EpisodeResult:
+        failure, columns = metrics.result(info)
+        time = info["completion_time"]
+        return EpisodeResult(
+            env=self.config.env,
+            seed=seed,
+            is_success=bool(info["is_success"]),
+            is_success_strict=bool(info["is_success_strict"]),
+            # Times are sums of 0.02 s; microseconds hide what floating point adds to them.
+            completion_time=None if time is None else round(float(time), 6),
+            steps=world.step_count,
+            failure=failure,
+            motion_clip=world.segment.clip,
+            motion_subject=world.segment.subject,
+            columns=columns,
+        )
 
 
 @contextlib.contextmanager
-def open_environments(task: Task, num_envs: int, workers: int) -> Iterator[Environments]:
-    """Give slots, and free them at the end.
+def open_envs(config: EnvConfig, num_envs: int, workers: int) -> Iterator[EnvPool]:
+    """Yield environments, and free them at the end.
 
     Args:
-        task: the environment of every slot.
-        num_envs: slots, 1 or more.
+        config: of every environment.
+        num_envs: 1 or more.
         workers: processes that step them; 0 steps them in this one.
 
     Raises:
@@ -260,47 +261,43 @@ def open_environments(task: Task, num_envs: int, workers: int) -> Iterator[Envir
     if workers < 0:
         raise RequestError(f"workers {workers}: must be 0 (no process of their own) or more")
     if workers:
-        with WorkerEnvironments(task, num_envs, min(workers, num_envs)) as environments:
-            yield environments
+        with WorkerEnvs(config, num_envs, min(workers, num_envs)) as envs:
+            yield envs
     else:
-        with contextlib.closing(SlotEnvironments(task, SlotArrays(task, num_envs))) as here:
+        with contextlib.closing(LocalEnvs(config, SharedArrays(config, num_envs))) as here:
             yield here
 
 
 @dataclass
 class _Worker:
-    """A process and the pipe to it.
-
-    Attributes:
-        orders: what it is working on.
-    """
+    """Process, the pipe to it, and the requests that it is working on."""
 
     process: Any
     pipe: Connection
-    orders: Sequence[Order] = ()
+    requests: Sequence[StepRequest] = ()
 
 
-class WorkerEnvironments:
-    """Slots dealt out to worker processes. Use as a context manager.
+class WorkerEnvs:
+    """Environments dealt out to worker processes. Use as a context manager.
 
     Args:
-        task: the environment of every slot.
-        num_envs: slots.
+        config: of every environment.
+        num_envs: n.
         workers: processes.
     """
 
-    def __init__(self, task: Task, num_envs: int, workers: int) -> None:
-        self.task = task
+    def __init__(self, config: EnvConfig, num_envs: int, workers: int) -> None:
+        self.config = config
         # Spawned, not forked: an OpenGL context does not survive a fork.
         context = multiprocessing.get_context("spawn")
-        buffer = context.RawArray("B", SlotArrays.size(task, num_envs))
-        self.arrays = SlotArrays(task, num_envs, buffer)
+        buffer = context.RawArray("B", SharedArrays.size(config, num_envs))
+        self.arrays = SharedArrays(config, num_envs, buffer)
         self._workers: list[_Worker] = []
         try:
             for _ in range(workers):
                 ours, theirs = context.Pipe()
                 process = context.Process(
-                    target=_work, args=(theirs, task, num_envs, buffer), daemon=True
+                    target=_work, args=(theirs, config, num_envs, buffer), daemon=True
                 )
                 self._workers.append(_Worker(process, ours))
                 with _without_interrupts():
@@ -310,7 +307,7 @@ class WorkerEnvironments:
             self.close()
             raise
 
-    def __enter__(self) -> WorkerEnvironments:
+    def __enter__(self) -> WorkerEnvs:
         return self
 
     def __exit__(
@@ -321,29 +318,29 @@ class WorkerEnvironments:
     ) -> None:
         self.close()
 
-    def submit(self, orders: Sequence[Order]) -> None:
-        """Give orders to slots that have none."""
+    def submit(self, requests: Sequence[StepRequest]) -> None:
+        """Send requests to environments that have none."""
         for number, worker in enumerate(self._workers):
-            mine = [order for order in orders if order.slot % len(self._workers) == number]
+            mine = [r for r in requests if r.env_id % len(self._workers) == number]
             if mine:
-                worker.orders = mine
+                worker.requests = mine
                 with contextlib.suppress(OSError):  # it has died; ``wait`` finds out why
                     worker.pipe.send(mine)
 
-    def wait(self) -> list[Event]:
-        """Wait until some slots are done, and say which.
+    def wait(self) -> list[StepResult]:
+        """Wait until some environments have answered, and return the answers.
 
         Raises:
-            RequestError: what a worker could not do was asked for wrongly.
+            RequestError: a worker could not do what was requested.
             RuntimeError: a worker failed or died.
         """
-        busy = {worker.pipe: worker for worker in self._workers if worker.orders}
-        events: list[Event] = []
+        busy = {worker.pipe: worker for worker in self._workers if worker.requests}
+        answers: list[StepResult] = []
         for pipe in wait(list(busy)):
             worker = busy[pipe]  # type: ignore[index]
-            events += _receive(worker)
-            worker.orders = ()
-        return events
+            answers += _receive(worker)
+            worker.requests = ()
+        return answers
 
     def close(self) -> None:
         """End the workers."""
@@ -359,16 +356,17 @@ class WorkerEnvironments:
         self._workers.clear()
 
 
-def _receive(worker: _Worker) -> list[Event]:
-    """Return the events that a worker reports, or raise what it failed with."""
+def _receive(worker: _Worker) -> list[StepResult]:
+    """Return the answers of a worker, or raise its error."""
     try:
         answer = worker.pipe.recv()
     except (EOFError, OSError) as error:
         worker.process.join(_PATIENCE)
-        slots = ", ".join(str(order.slot) for order in worker.orders)
+        numbers = ", ".join(str(request.env_id) for request in worker.requests)
         raise RuntimeError(
-            f"the worker process of slots {slots} died (exit code {worker.process.exitcode}); "
-            "if it was killed for lack of memory, take fewer --num_envs or --workers"
+            f"the worker process of environments {numbers} died (exit code "
+            f"{worker.process.exitcode}); if it was killed for lack of memory, take fewer "
+            "--num_envs or --workers"
         ) from error
     if isinstance(answer, RequestError):
         raise answer
@@ -377,17 +375,18 @@ def _receive(worker: _Worker) -> list[Event]:
     return answer
 
 
-def _work(pipe: Connection, task: Task, num_envs: int, buffer: Any) -> None:
-    """Carry out orders until the pipe ends; what goes wrong is reported through it."""
-    answer: list[Event] | RequestError | str
-    with contextlib.closing(SlotEnvironments(task, SlotArrays(task, num_envs, buffer))) as here:
+def _work(pipe: Connection, config: EnvConfig, num_envs: int, buffer: Any) -> None:
+    """Carry out requests until the pipe ends; errors are reported through it."""
+    answer: list[StepResult] | RequestError | str
+    arrays = SharedArrays(config, num_envs, buffer)
+    with contextlib.closing(LocalEnvs(config, arrays)) as here:
         while True:
             try:
-                orders = pipe.recv()
+                requests = pipe.recv()
             except (EOFError, OSError):  # the run is over
                 return
             try:
-                here.submit(orders)
+                here.submit(requests)
                 answer = here.wait()
             except RequestError as error:
                 answer = RequestError(str(error))
@@ -416,3 +415,15 @@ def _without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _layout(config: EnvConfig, num_envs: int) -> list[tuple[tuple[int, ...], Any]]:
+    return [
+        ((num_envs, config.vector_size), np.float32),
+        ((num_envs, config.action_size), np.float32),
+        ((num_envs, *config.image_shape), np.uint8),
+    ]
+
+
+def _padded(size: int) -> int:
+    return -(-size // _ALIGNMENT) * _ALIGNMENT

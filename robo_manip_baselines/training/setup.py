@@ -16,7 +16,7 @@ from robo_manip_baselines.data.demonstrations import (
     split_episodes,
 )
 from robo_manip_baselines.data.normalization import METHODS, Normalization
-from robo_manip_baselines.envs.mujoco.tasks.registry import env_id
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.policy.checkpoint import (
     Checkpoint,
     read_checkpoint,
@@ -67,11 +67,12 @@ class TrainSetup:
             RequestError: there are none, or they do not fit the configuration.
         """
         settings, seed = config.training, config.seed
-        given = load_demonstrations(config.demonstrations, config.spec, limit=config.num_episodes)
-        if given.env_id != env_id(config.env):
-            raise RequestError(
-                f"'{config.demonstrations}' holds {given.env_id}, not {env_id(config.env)}"
-            )
+        given = load_demonstrations(
+            config.demonstrations, config.spec, limit=config.num_episodes, env=config.env
+        )
+        env_id = task_entry(config.env).env_id
+        if given.env_id != env_id:
+            raise RequestError(f"'{config.demonstrations}' holds {given.env_id}, not {env_id}")
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = given.indices(split.train)
         rows = given.rows(train)

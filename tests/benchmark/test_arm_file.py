@@ -9,9 +9,9 @@ import pytest
 from robo_manip_baselines.benchmark.conditions import ARMS, ArmLine, choose_arms, read_arms
 from robo_manip_baselines.benchmark.presets import PRESETS
 from robo_manip_baselines.benchmark.statistics.conditions import FURTHER, PREDICTION
-from robo_manip_baselines.commands.train import parse_config
 from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.training.options import parse_options
 
 
 def write(folder: Path, text: str) -> Path:
@@ -69,8 +69,8 @@ def test_the_names_of_the_presets_arms_are_there() -> None:
 )
 def test_an_arm_is_what_training_is_told(arm: ArmLine, given: str) -> None:
     assert " ".join(arm.train_args) == given
-    config = parse_config(["Mlp", "--preset", "cpu", *arm.train_args], has_gpu=False)
-    assert (config.spec.obs, config.to_json()["error"]) == (arm.obs, arm.shown_error)
+    options = parse_options(["Mlp", "--preset", "cpu", *arm.train_args], has_gpu=False)
+    assert (options.obs, options.detection.error or "none") == (arm.obs, arm.shown_error)
 
 
 def test_a_title_is_shown_and_names_speak_otherwise() -> None:

@@ -155,7 +155,7 @@ def test_a_chunk_is_asked_for_only_when_the_last_is_used_up() -> None:
 
 @pytest.mark.parametrize("execute", [6, 100])
 def test_no_more_than_a_chunk_can_be_carried_out(execute: int) -> None:
-    with pytest.raises(RequestError, match=rf"\(--execute\) {execute}: must be 1 to 5"):
+    with pytest.raises(RequestError, match=f"n_action_steps {execute}: must be 1 to 5"):
         make_action_buffer(
             ActionExecution(temporal_ensemble=False, n_action_steps=execute), 1, 5, 1
         )

@@ -19,9 +19,8 @@ from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
 from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.registry import ENTRY_POINT_GROUP, policy_entry, policy_names
-from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording, rollout
-from robo_manip_baselines.rollout.workers import Task, open_environments
+from robo_manip_baselines.rollout.workers import EnvConfig
 from robo_manip_baselines.runs.errors import RequestError
 
 SHORT = {
@@ -127,7 +126,7 @@ def test_the_pages_commands_train_and_evaluate(run: Path) -> None:
 @pytest.mark.long
 def test_sampled_actions_do_not_depend_on_environments_and_workers(run: Path) -> None:
     checkpoint = read_checkpoint(run / "runs/flow")
-    task = Task(checkpoint.env, checkpoint.spec, {"max_episode_steps": 25})
+    config = EnvConfig(checkpoint.env, checkpoint.spec, {"max_episode_steps": 25})
     seeds, played = [1003, 1000, 1001], {}
     for num_envs in (1, 3):
         for workers in (0, 2):
@@ -139,15 +138,16 @@ def test_sampled_actions_do_not_depend_on_environments_and_workers(run: Path) ->
                 num_envs=num_envs,
             )
             torch.rand(1)  # the global generator is not used
-            recordings: dict[int, Recording] = {}
-            with open_environments(task, num_envs, workers) as environments:
-                results = rollout(
-                    *(policy, environments, seeds),
-                    on_episode=lambda r, recording, kept=recordings: kept.update(
-                        {r.seed: recording}
-                    ),
-                )
-            played[num_envs, workers] = results, recordings
+            recorded: dict[int, Recording] = {}
+
+            def keep(
+                result: EpisodeResult, recording: Recording, kept: dict[int, Recording] = recorded
+            ) -> None:
+                kept[result.seed] = recording
+
+            with open_envs(config, num_envs, workers) as envs:
+                results = rollout(policy, envs, seeds, on_episode=keep)
+            played[num_envs, workers] = results, recorded
     results, recordings = played[1, 0]
     for other_results, other in played.values():
         assert other_results == results

@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.state import to_vector, vector_names
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.runs.errors import RequestError
 
 SPEC = ObservationSpec(obs="current", cameras=("angle", "top"), image_size=(6, 8))
-SIZE = len(vector_names(SPEC))
+SIZE = len(SPEC.vector_names(ObservedNames()))
 ENSEMBLE, FIRST = ActionExecution(), ActionExecution(temporal_ensemble=False, n_action_steps=2)
 
 
@@ -54,14 +53,14 @@ def normalization() -> Normalization:
     return Normalization(*draw)
 
 
-def observe(count: int, seed: int = 0) -> dict[str, NDArray[np.generic]]:
+Observed = tuple[NDArray[np.float32], NDArray[np.uint8]]
+
+
+def observe(count: int, seed: int = 0) -> Observed:
+    """Vectors (b, S) and images (b, N, H, W, 3)."""
     rng = np.random.default_rng(seed)
-    components = SPEC.components()
-    vectors = {
-        k: rng.normal(size=(count, len(v))).astype(np.float32) for k, v in components.items()
-    }
-    images = {k: rng.integers(0, 256, (count, 6, 8, 3)).astype(np.uint8) for k in SPEC.image_keys()}
-    return {**vectors, **images}
+    vectors = rng.normal(size=(count, SIZE)).astype(np.float32)
+    return vectors, rng.integers(0, 256, (count, 2, 6, 8, 3)).astype(np.uint8)
 
 
 def policy(
@@ -80,18 +79,16 @@ def test_a_gpu_acts_as_a_cpu_does() -> None:
     for step in range(3):
         on_cpu, on_gpu = (policy(5, device=device) for device in ("cpu", "cuda"))
         observations = observe(5, step)
-        given = [one.act(observations, np.arange(5)) for one in (on_cpu, on_gpu)]
+        given = [one.act(*observations, np.arange(5)) for one in (on_cpu, on_gpu)]
         np.testing.assert_allclose(given[0], given[1], atol=5e-3)  # TF32 convolution
 
 
 def test_the_first_action_is_what_the_network_says_in_units_of_the_joints() -> None:
     observations = observe(2)
-    given = policy(2).act(observations, np.arange(2))
+    given = policy(2).act(*observations, np.arange(2))
     model, scale = Network().eval(), normalization()
-    state = torch.from_numpy(scale.normalize_state(to_vector(SPEC, observations)))
-    images = torch.from_numpy(
-        np.stack([observations["images/angle"], observations["images/top"]], axis=1)[:, None]
-    )
+    state = torch.from_numpy(scale.normalize_state(observations[0]))
+    images = torch.from_numpy(observations[1][:, None])
     with torch.no_grad():
         expected = scale.unnormalize_action(
             model.predict(state[:, None], images, None)[:, 0].numpy()
@@ -116,15 +113,15 @@ def test_a_row_does_not_depend_on_its_neighbours(
     rows = np.array([6, 2, 0, 5, 1])
     for step in range(5):
         observations = observe(5, step)
-        together = many.act(observations, rows)
-        single = alone.act({k: v[1:2] for k, v in observations.items()}, np.array([0]))
+        together = many.act(*observations, rows)
+        single = alone.act(*(part[1:2] for part in observations), np.array([0]))
         np.testing.assert_array_equal(together[1:2], single)
 
 
 @pytest.mark.parametrize(("tile", "rows"), [(None, [1] * 5), (2, [2, 2, 2]), (8, [8])])
 def test_the_network_always_sees_whole_tiles(tile: int | None, rows: list[int]) -> None:
     runner = policy(5, tile=tile)
-    runner.act(observe(5), np.arange(5))
+    runner.act(*observe(5), np.arange(5))
     assert runner._model.rows == rows
 
 
@@ -132,13 +129,13 @@ def test_only_environments_that_need_a_prediction_are_computed() -> None:
     runner = policy(3, FIRST)
     both, one = np.array([0, 2]), np.array([2])
     assert runner.needs_images(both).all()
-    runner.act(observe(2), both)
+    runner.act(*observe(2), both)
     assert not runner.needs_images(both).any()
-    images = {k: v * 0 for k, v in observe(2).items() if k.startswith("images/")}
     stale, fresh = policy(3, FIRST), runner
-    stale.act(observe(2), both)
+    stale.act(*observe(2), both)
+    vectors, images = observe(2, 1)
     np.testing.assert_array_equal(
-        fresh.act(observe(2, 1), both), stale.act({**observe(2, 1), **images}, both)
+        fresh.act(vectors, images, both), stale.act(vectors, images * 0, both)
     )
     assert fresh._model.rows == [1, 1]
     fresh.reset(one, [5])
@@ -149,7 +146,7 @@ def test_rows_of_a_tile_that_are_not_used_do_not_matter() -> None:
     """What an earlier tile left in the memory is wiped, so that even its NaNs do no harm."""
     runner = policy(4, tile=4)
     runner._state_tile.fill_(torch.nan)
-    runner.act(observe(1), np.array([0]))
+    runner.act(*observe(1), np.array([0]))
     assert not torch.isnan(runner._state_tile).any()
 
 
@@ -158,14 +155,14 @@ def test_numbers_that_are_not_finite_are_refused() -> None:
     with torch.no_grad():
         runner._model.weight.fill_(torch.nan)
     with pytest.raises(RequestError, match="not finite"):
-        runner.act(observe(1), np.array([0]))
+        runner.act(*observe(1), np.array([0]))
 
 
 def test_bf16_is_close_and_other_precisions_are_refused() -> None:
     half = PolicyRunner(
         Network(), SPEC, normalization(), ENSEMBLE, num_envs=1, precision="bf16"
     ).act(observe(1), np.array([0]))
-    full = policy(1).act(observe(1), np.array([0]))
+    full = policy(1).act(*observe(1), np.array([0]))
     # bf16 has 8 bits: sums of 18 products of about 1, through tanh, scaled by up to 2.
     np.testing.assert_allclose(half, full, atol=0.1)
     assert not np.array_equal(half, full)
@@ -196,11 +193,9 @@ def play(runner: PolicyRunner, envs: dict[int, int], steps: int) -> list[NDArray
     actions = []
     for step in range(steps):
         rows = [observe(1, 100 * seed + step) for seed in envs.values()]
-        joined = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
-        unneeded = ~runner.needs_images(env_ids)
-        for key in SPEC.image_keys():
-            joined[key][unneeded] = 77
-        actions.append(runner.act(joined, env_ids))
+        vectors, images = map(np.concatenate, zip(*rows, strict=True))
+        images[~runner.needs_images(env_ids)] = 77
+        actions.append(runner.act(vectors, images, env_ids))
     return actions
 
 
@@ -219,11 +214,9 @@ def test_the_window_holds_the_last_observations(n_action_steps: int) -> None:
     assert len(model.windows) == len(predicted)
     for step, (state, images, _) in zip(predicted, model.windows, strict=True):
         for place, past in enumerate((2, 1, 0)):
-            expected = observe(1, 900 + max(step - past, 0))
-            vector = scale.normalize_state(to_vector(SPEC, expected))
-            np.testing.assert_array_equal(state[:, place], vector)
-            for camera, key in enumerate(SPEC.image_keys()):
-                np.testing.assert_array_equal(images[:, place, camera], expected[key])
+            vectors, views = observe(1, 900 + max(step - past, 0))
+            np.testing.assert_array_equal(state[:, place], scale.normalize_state(vectors))
+            np.testing.assert_array_equal(images[:, place], views)
 
 
 def test_noise_is_a_function_of_the_episodes_seed_and_of_the_step() -> None:

@@ -18,7 +18,7 @@ from robo_manip_baselines.data import episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.data.normalization import Normalization, mean_std
-from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.batching import BatchLoader, part_of
@@ -135,7 +135,7 @@ def test_noise_is_normal_and_new_at_every_step(blind: Demonstrations) -> None:
 
 @pytest.mark.parametrize("world_size", [1, 2, 3, 4])
 def test_processes_share_a_batch_out(blind: Demonstrations, world_size: int) -> None:
-    noise = {"state_noise": StateNoise(blind.spec, robot=0.3)}
+    noise = {"state_noise": StateNoise(blind.spec, ObservedNames(), robot=0.3)}
     whole = make_loader(blind, **noise)
     parts = [
         make_loader(blind, rank=rank, world_size=world_size, **noise) for rank in range(world_size)
@@ -190,7 +190,7 @@ def test_windows_end_with_the_example_and_begin_in_its_episode(
     sampler = ExampleSampler(shown.lengths[list(TRAIN)], "frame", 4, 5)
     with ImageStore(shown, memory_budget=budget) as images:
         loader = make_loader(shown, images=images, n_obs_steps=3)
-        noise = StateNoise(shown.spec, robot=0.3)
+        noise = StateNoise(shown.spec, ObservedNames(), robot=0.3)
         noisy = make_loader(shown, images=images, n_obs_steps=3, state_noise=noise)
         for step in range(6):
             batch = loader.batch(step)

@@ -18,6 +18,9 @@ from robo_manip_baselines.runs.errors import RequestError
 TIMESTEP: Final = 0.002
 """Physics step, seconds: ten make one control step at 50 Hz."""
 
+CONTROL_PERIOD: Final = 0.02
+"""s between two actions (paper, Algorithm 1, line 2)."""
+
 BASE_X: Final = 0.469
 BASE_Y: Final = 0.5
 """The arms' bases stand at (∓`BASE_X`, `BASE_Y`, 0), facing each other (public ALOHA cell)."""

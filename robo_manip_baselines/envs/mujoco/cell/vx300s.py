@@ -11,16 +11,6 @@ from typing import Final
 
 import mujoco
 
-ARM_JOINTS: Final = (
-    "waist",
-    "shoulder",
-    "elbow",
-    "forearm_roll",
-    "wrist_angle",
-    "wrist_rotate",
-)
-"""The six revolute joints, base to gripper; each has a position actuator of the same name."""
-
 HOME_QPOS: Final = (0.0, -0.96, 1.16, 0.0, -0.3, 0.0)
 """Home pose of `ARM_JOINTS`, radians (that of the public ALOHA simulation)."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import attach_arm
-from robo_manip_baselines.envs.mujoco.cell.vx300s import ARM_JOINTS
+from robo_manip_baselines.observation.spec import ARM_JOINTS
 
 POSITION_TOLERANCE = 2e-4
 """m; a fiftieth of the narrowest tolerance of a task."""

@@ -1,8 +1,8 @@
-"""Phases that scripted experts are made of: each says where the gripper should be next.
+"""Phases of scripted experts: each commands the gripper until it is done.
 
-A phase is started with the last command, gives a command every control step, and says when it is
-done. It knows the world only through a ``View``, so that a new task can string the same phases
-together.
+A phase is started with the last command, gives a command every control step, and reports when it
+is done. It knows the world only through an `ExpertView`, so that a new task can string the same
+phases together.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import mink
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES
-from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, CONTROL_PERIOD
 from robo_manip_baselines.observation import FRAME_PERIOD
 
 RIGHT_BASE = np.array(ARM_BASES["right"][0])
@@ -42,7 +41,7 @@ def level_at(position: NDArray[np.float64]) -> mink.SO3:
 
 @dataclass(frozen=True)
 class Command:
-    """Where the gripper should be.
+    """Commanded pose of the gripper.
 
     Attributes:
         position: (3,) m, world.
@@ -56,8 +55,8 @@ class Command:
 
 
 @dataclass(frozen=True)
-class View:
-    """What an expert may look at: the truth of the present, and of the recorded future.
+class ExpertView:
+    """State that an expert acts on: the present, and the recorded future.
 
     Attributes:
         object_position: (3,) m, world.
@@ -77,19 +76,19 @@ class View:
         return np.array([np.interp(lead, ahead, axis) for axis in self.mouth_track.T])
 
 
-class Phase(Protocol):
+class ExpertPhase(Protocol):
     """A stretch of an expert's work."""
 
-    def start(self, view: View, last: Command) -> None:
-        """Begin, the gripper having been told to be at ``last``."""
+    def start(self, view: ExpertView, last: Command) -> None:
+        """Begin, ``last`` being the last command."""
         ...
 
-    def step(self, view: View) -> Command:
+    def step(self, view: ExpertView) -> Command:
         """Return the command of the next control step."""
         ...
 
-    def is_done(self, view: View) -> bool:
-        """Whether the next phase may begin."""
+    def is_done(self, view: ExpertView) -> bool:
+        """Return whether the next phase may begin."""
         ...
 
 
@@ -104,21 +103,21 @@ class Reach:
 
     def __init__(
         self,
-        target: Callable[[View, Command], Command],
+        target: Callable[[ExpertView, Command], Command],
         *,
         speed: float = 0.25,
         least_duration: float = 0.3,
     ) -> None:
         self._target_of, self._speed, self._least = target, speed, least_duration
 
-    def start(self, view: View, last: Command) -> None:
+    def start(self, view: ExpertView, last: Command) -> None:
         """Fix the line and its duration."""
         self._from, self._to = last, self._target_of(view, last)
         length = float(np.linalg.norm(self._to.position - last.position))
         self._steps = max(1, round(max(length / self._speed, self._least) / CONTROL_PERIOD))
         self._step = 0
 
-    def step(self, view: View) -> Command:
+    def step(self, view: ExpertView) -> Command:
         """Advance along the line."""
         self._step += 1
         share = least_jerk(self._step / self._steps)
@@ -128,7 +127,7 @@ class Reach:
             finger=self._from.finger + share * (self._to.finger - self._from.finger),
         )
 
-    def is_done(self, view: View) -> bool:
+    def is_done(self, view: ExpertView) -> bool:
         """Done at the end of the line."""
         return self._step >= self._steps
 
@@ -144,16 +143,16 @@ class Grip:
     def __init__(self, finger: float, duration: float) -> None:
         self._finger, self._steps = finger, round(duration / CONTROL_PERIOD)
 
-    def start(self, view: View, last: Command) -> None:
+    def start(self, view: ExpertView, last: Command) -> None:
         """Keep the pose of the last command."""
         self._command, self._step = replace(last, finger=self._finger), 0
 
-    def step(self, view: View) -> Command:
+    def step(self, view: ExpertView) -> Command:
         """Hold."""
         self._step += 1
         return self._command
 
-    def is_done(self, view: View) -> bool:
+    def is_done(self, view: ExpertView) -> bool:
         """Done when the time is over."""
         return self._step >= self._steps
 
@@ -164,7 +163,7 @@ class Approach:
     That is lines 9 to 15 of the paper's Algorithm 1.
 
     The velocity is (mouth - gripper) / (limit - t), with t since the lift and the gripper where it
-    was last told to be.
+    was last commanded.
 
     Args:
         limit: s since the lift.
@@ -174,11 +173,11 @@ class Approach:
     def __init__(self, *, limit: float = 6.0, lead: float = 0.0) -> None:
         self._limit, self._lead = limit, lead
 
-    def start(self, view: View, last: Command) -> None:
+    def start(self, view: ExpertView, last: Command) -> None:
         """Start from the last command."""
         self._command = last
 
-    def step(self, view: View) -> Command:
+    def step(self, view: ExpertView) -> Command:
         """Move by velocity times control period."""
         # Below one control period, the step would go past the mouth.
         elapsed = view.time_since_lift or 0.0
@@ -188,7 +187,7 @@ class Approach:
         self._command = replace(self._command, position=position, orientation=level_at(position))
         return self._command
 
-    def is_done(self, view: View) -> bool:
+    def is_done(self, view: ExpertView) -> bool:
         """Done at the mouth, when the time is up, or at once if nothing was lifted."""
         elapsed = view.time_since_lift
         return view.is_at_mouth or elapsed is None or elapsed > self._limit
@@ -217,13 +216,13 @@ class Follow:
         self._offset, self._steps = offset, round(duration / CONTROL_PERIOD)
         self._finger, self._lead, self._speed = finger, lead, speed
 
-    def start(self, view: View, last: Command) -> None:
+    def start(self, view: ExpertView, last: Command) -> None:
         """Note how far from the wanted place it starts."""
         finger = last.finger if self._finger is None else self._finger
         self._last, self._step = replace(last, finger=finger), 0
         self._gap = last.position - view.mouth(self._lead) - self._offset
 
-    def step(self, view: View) -> Command:
+    def step(self, view: ExpertView) -> Command:
         """Move with the mouth and close the gap to the wanted place."""
         self._step += 1
         distance = float(np.linalg.norm(self._gap))
@@ -233,7 +232,7 @@ class Follow:
         self._last = replace(self._last, position=position, orientation=level_at(position))
         return self._last
 
-    def is_done(self, view: View) -> bool:
+    def is_done(self, view: ExpertView) -> bool:
         """Done when the time is over."""
         return self._step >= self._steps
 

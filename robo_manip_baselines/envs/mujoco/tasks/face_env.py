@@ -1,10 +1,10 @@
-"""What every task with a moving face shares: the cell, the replayed head, arms, observations."""
+"""Base of every task with a moving face: the cell, the replayed head, arms, observations."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import mujoco
@@ -12,13 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
-from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import (
-    ARM_JOINTS,
-    FINGER_CLOSED,
-    FINGER_OPEN,
-    HOME_QPOS,
-)
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, MOUTH_BASE, build_cell
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import FaceModel, add_face
 from robo_manip_baselines.envs.mujoco.face.motion import (
     SEGMENT_DURATION,
@@ -26,12 +21,20 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
     MotionSegment,
 )
 from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FaceReplay
-from robo_manip_baselines.observation import ObservationSpec, Truth, observe
-from robo_manip_baselines.observation.detector import NO_PREDICTION, Detector
+from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry
+from robo_manip_baselines.observation import (
+    ARM_JOINTS,
+    CAMERAS,
+    FRAME_PERIOD,
+    Corruption,
+    ObservationSpec,
+    ObservedNames,
+    State,
+)
+from robo_manip_baselines.observation.corruption import NO_PREDICTION
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
-CONTROL_PERIOD = 0.02
-"""s between two actions (paper, Algorithm 1, line 2)."""
+Floats = NDArray[np.float64]
 
 FACE_OFFSET = 0.05
 """m, largest random offset of the face along each axis (paper, Algorithm 1, line 3)."""
@@ -40,40 +43,89 @@ PARKED_QPOS = (0.0, -1.8, 1.55, 0.0, -1.2, 0.0)
 """rad, the left arm folded back over its base, out of the head's way."""
 
 RENDER_CAMERA = "angle"
-"""What ``render()`` shows."""
+"""Camera of ``render()``."""
+
+# Wide enough for whatever physics may do; observations are not clipped to them.
+_BOUNDS = {" position": 2.0 * np.pi, " velocity": 100.0, "t_": 60.0}
+"""rad, m; rad/s, m/s; s."""
+
+_LENGTH_BOUND = 5.0
+"""m, of everything else."""
 
 
 class FaceEnv(gymnasium.Env[Any, Any]):
-    """A cell with two arms and a head that moves as a recorded person moved.
+    """Cell with two arms and a head that moves as a recorded person moved.
 
-    A task derives from it: it adds its objects to the scene, draws their start, and says after
-    each step what has been achieved.
+    A task derives from it and implements the methods of the section "task": its objects, their
+    start, and after each step the reward, the end and ``info``. The ``info`` of every task holds
+    ``is_success`` and ``is_success_strict`` (bool), ``completion_time`` (s, None before success)
+    and ``phase`` (one of ``phase_names``).
+
+    Args:
+        obs, horizon, cameras, image_size, object_pose, arms: see `ObservationSpec`.
+        corruption: a `Corruption`, or its fields as a dict; None shows the truth.
+        face_motion: start of the recorded motion: ``episode`` or ``after_lift``.
+        clips: ids of recorded clips to draw from; all if None.
+        motion_library: file of ``face_prediction export-motion``; the shipped one if None.
+        shadows, multisamples: prettier and slower images, for videos.
+        render_mode: ``rgb_array`` or ``human`` (MuJoCo's viewer).
+
+    Attributes:
+        task: entry of the task.
+        observation_spec: what is observed.
+        renders_images: whether observations include images; rollouts clear it for steps whose
+            images no policy reads.
+        vector: (S,) float32, all vectors of the last observation, packed.
+
+    Raises:
+        RequestError: an argument is not valid.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (the name and its kind are Gymnasium's)
-        "render_modes": ["rgb_array"],
+        "render_modes": ["rgb_array", "human"],
         "render_fps": round(1.0 / CONTROL_PERIOD),
     }
+    task: ClassVar[TaskEntry]
+    phase_names: ClassVar[tuple[str, ...]]
 
     def __init__(
         self,
         *,
-        spec: ObservationSpec,
-        face_motion: str,
-        clips: Sequence[str] | None,
-        motion_library: str | None,
-        shadows: bool,
-        multisamples: int,
-        render_mode: str | None,
+        obs: str = "baseline",
+        horizon: int = 2,
+        cameras: Sequence[str] = CAMERAS,
+        image_size: tuple[int, int] = (480, 640),
+        object_pose: bool = False,
+        arms: str = "right",
+        corruption: Corruption | Mapping[str, Any] | None = None,
+        face_motion: str = "episode",
+        clips: Sequence[str] | None = None,
+        motion_library: str | None = None,
+        shadows: bool = False,
+        multisamples: int = 0,
+        render_mode: str | None = None,
     ) -> None:
         if render_mode is not None:
             require_choice("render mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
-        self.observation_spec = spec
+        if not isinstance(corruption, Corruption):
+            corruption = Corruption.from_json(corruption or {})
+        spec = self.observation_spec = ObservationSpec(
+            obs=obs,
+            horizon=horizon,
+            cameras=tuple(cameras),
+            image_size=(image_size[0], image_size[1]),
+            object_pose=object_pose,
+            arms=arms,
+            corruption=corruption,
+        )
+        if object_pose and not self.task.names.objects:
+            raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")
+        self.renders_images = True
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
-        self._detector = Detector.of(spec)
+        self._pipeline = spec.make_pipeline()
         self.library = MotionLibrary.load(motion_library)
-        if spec.corruption and spec.corruption.error == "model" and self.library.predicted is None:
+        if spec.corruption.error == "model" and self.library.predicted is None:
             raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
         self.clips = (
             None
@@ -92,23 +144,45 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.renderer = CameraRenderer(
             self.model, height, width, shadows=shadows, multisamples=multisamples
         )
+        self._viewer: Any = None
         self._index_model()
         self.action_space = self._make_action_space()
-        self.observation_space = observation_space(spec)
+        self.observation_space = make_observation_space(spec, self.task.names)
 
-    # -- what a task says -----------------------------------------------------------------------
+    # -- task -----------------------------------------------------------------------------------
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Add the objects of the task to the scene before it is compiled."""
+
+    def reset_task(self, rng: np.random.Generator) -> None:
+        """Draw the start of the objects into ``self.data.qpos``, and reset the task's progress."""
+
+    def object_position(self) -> Floats:
+        """(O, 3) m, world: centres of the task's objects."""
+        return np.empty((0, 3))
+
+    def watch_contacts(self) -> None:
+        """Read the contacts of one physics step."""
+
+    def advance(self) -> tuple[float, bool]:
+        """Evaluate the task after a control step; return reward and whether it has ended."""
         raise NotImplementedError
 
-    def reset_objects(self, rng: np.random.Generator) -> None:
-        """Draw where the objects start, into ``self.data.qpos``."""
+    def info(self) -> dict[str, Any]:
+        """Return the ``info`` of the present step."""
         raise NotImplementedError
 
-    def object_position(self) -> NDArray[np.float64]:
-        """(3,) m, world: centre of the object that the policy handles."""
-        raise NotImplementedError
+    def task_row(self) -> dict[str, Any]:
+        """Return the present values of the fields that the task adds to episode files."""
+        return {}
+
+    def target_track(self) -> Floats:
+        """(K, 3) m, world: the true target now and 1 ... 5 frames ahead; the mouth by default."""
+        return self.mouth_track
+
+    def predicted_target(self) -> Floats | None:
+        """(K - 1, 3) m, world: a predictor's output for the target; None without predictions."""
+        return self.predicted_mouth
 
     # -- indices --------------------------------------------------------------------------------
 
@@ -156,16 +230,30 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         )
         self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
-        self.reset_objects(self.np_random)
+        self.reset_task(self.np_random)
         self._place_face(0)
         position, orientation = self.replay.bodies["face/mouth"]
         self.data.joint("face/cavity").qpos = (*position[0], *orientation[0])
         mujoco.mj_forward(self.model, self.data)
-        if self._detector:
-            # Last, so that the world is the one that it would be without corruption.
+        if self._pipeline:
+            # Last, so that the world is the same as without corruption.
             drawn = int(self.np_random.integers(2**32)) if seed is None else seed
-            self._detector.reset(drawn)
-        return self.observe(), {}
+            self._pipeline.reset(drawn)
+        self._show()
+        return self.observe(), self.info()
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
+        """Move for 0.02 s.
+
+        Raises:
+            ValueError: the action has the wrong shape or is not finite.
+        """
+        self.simulate(action)
+        reward, terminated = self.advance()
+        self._show()
+        return self.observe(), reward, terminated, False, self.info()
 
     def simulate(self, action: NDArray[Any]) -> None:
         """Apply an action for one control period, the face moving at every physics step.
@@ -189,21 +277,34 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
-    def watch_contacts(self) -> None:
-        """Look at the contacts of one physics step; a task that cares overrides it."""
-
     def start_motion(self) -> None:
         """Let the recorded motion start now, if it has been waiting."""
         if self.motion_start is None:
             self.motion_start = self.step_count
 
-    def render(self) -> NDArray[np.uint8]:
-        """Return the view of the camera ``angle``, (H, W, 3) uint8."""
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the view of the camera ``angle``, (H, W, 3) uint8; None in mode ``human``."""
+        if self.render_mode == "human":
+            self._show()
+            return None
         return self.renderer.render(self.data, [RENDER_CAMERA])[RENDER_CAMERA]
 
     def close(self) -> None:
-        """Free the OpenGL context."""
+        """Free the OpenGL context, and close the viewer."""
         self.renderer.close()
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    def _show(self) -> None:
+        """Show the present state in MuJoCo's viewer, in mode ``human``."""
+        if self.render_mode != "human":
+            return
+        if self._viewer is None:
+            from mujoco import viewer  # opens a display's libraries
+
+            self._viewer = viewer.launch_passive(self.model, self.data)
+        self._viewer.sync()
 
     # -- state ----------------------------------------------------------------------------------
 
@@ -213,19 +314,19 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return self.step_count * CONTROL_PERIOD
 
     @property
-    def gripper_position(self) -> NDArray[np.float64]:
+    def gripper_position(self) -> Floats:
         """(3,) m, world: site ``right/gripper``."""
         return self.data.site_xpos[self._gripper_site].copy()
 
     @property
-    def gripper_orientation(self) -> NDArray[np.float64]:
+    def gripper_orientation(self) -> Floats:
         """(4,) wxyz, world from the site ``right/gripper``."""
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, self.data.site_xmat[self._gripper_site])
         return quat
 
     @property
-    def head_orientation(self) -> NDArray[np.float64]:
+    def head_orientation(self) -> Floats:
         """(4,) wxyz, world from head; identity for an upright face that looks along world +x."""
         return self.data.mocap_quat[self._mocap["face/head"]].copy()
 
@@ -240,13 +341,13 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return [self.model.actuator(actuator).name for actuator in self._actuators]
 
     @property
-    def mouth_track(self) -> NDArray[np.float64]:
+    def mouth_track(self) -> Floats:
         """(K, 3) m, world: the true mouth now and 1 ... 5 frames ahead."""
         return self.replay.mouth[self.replay.control_index(self._motion_step())].copy()
 
     @property
-    def predicted_mouth(self) -> NDArray[np.float64] | None:
-        """(K - 1, 3) m, world: the mouth 1 ... 5 frames ahead as a trained predictor foretold it.
+    def predicted_mouth(self) -> Floats | None:
+        """(K - 1, 3) m, world: the mouth 1 ... 5 frames ahead as forecast by a trained predictor.
 
         None if the motion library holds no predictions.
         """
@@ -260,35 +361,80 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return float(self.replay.jaw[self.replay.control_index(self._motion_step())])
 
     @property
-    def mouth_opening(self) -> NDArray[np.float64]:
+    def mouth_opening(self) -> Floats:
         """(2,) m: half width and half height of the opening between the inner lips."""
         return self.replay.opening[self.replay.control_index(self._motion_step())]
 
-    def truth(self) -> Truth:
-        """What is so now, uncorrupted."""
+    def state(self) -> State:
+        """Return the state before corruption."""
         data = self.data
-        return Truth(
+        return State(
             time=np.asarray(self.time),
             joint_position=data.qpos[self._joint_qpos],
             joint_velocity=data.qvel[self._joint_dof],
             gripper_position=data.qpos[self._finger_qpos],
             gripper_velocity=data.qvel[self._finger_dof],
             end_effector_position=self.gripper_position,
-            mouth_position=self.mouth_track,
+            target_position=self.target_track(),
             object_position=self.object_position(),
-            predicted_mouth=self.predicted_mouth,
+            predicted_target=self.predicted_target(),
         )
 
     def observe(self) -> dict[str, NDArray[Any]]:
-        """Build the observation that the spec asks for, rendering only its cameras."""
-        truth = self.truth()
-        report = self._detector.report(truth) if self._detector else None
-        observation: dict[str, NDArray[Any]] = {**observe(self.observation_spec, truth, report)}
-        if self.observation_spec.cameras:
-            views = self.renderer.render(self.data, self.observation_spec.cameras)
-            for key, camera in self.observation_spec.image_keys().items():
+        """Build the observation that the spec asks for, rendering only its cameras.
+
+        The vectors are views of ``vector``. Images are left out where ``renders_images`` is False.
+        """
+        spec, state = self.observation_spec, self.state()
+        self.vector = spec.pack(state, self._pipeline.observe(state) if self._pipeline else None)
+        observation: dict[str, NDArray[Any]] = {**spec.split(self.vector, self.task.names)}
+        if spec.cameras and self.renders_images:
+            views = self.renderer.render(self.data, spec.cameras)
+            for key, camera in spec.image_keys().items():
                 observation[key] = views[camera]
         return observation
+
+    def episode_row(self) -> dict[str, Any]:
+        """Return the present row of an episode file: the state before an action."""
+        state = self.state()
+        predicted = self.predicted_mouth
+        return {
+            "time": self.time,
+            "joint_position": state.joint_position.ravel(),
+            "joint_velocity": state.joint_velocity.ravel(),
+            "gripper_position": state.gripper_position,
+            "gripper_velocity": state.gripper_velocity,
+            "end_effector_position": state.end_effector_position,
+            "end_effector_orientation": self.gripper_orientation,
+            "mouth_position": self.mouth_track,
+            **({} if predicted is None else {"predicted_mouth": predicted}),
+            "head_orientation": self.head_orientation,
+            "jaw_opening": self.jaw_opening,
+            "phase": np.int8(self.phase_names.index(self.info()["phase"])),
+            "qpos": self.data.qpos.copy(),
+            "qvel": self.data.qvel.copy(),
+            **self.task_row(),
+        }
+
+    def start_attributes(self) -> dict[str, Any]:
+        """Return the attributes of an episode file that are known after its reset.
+
+        A task with attributes of its own extends it.
+        """
+        segment = self.segment
+        return {
+            "motion_clip": segment.clip,
+            "motion_subject": segment.subject,
+            "motion_start_index": segment.index,
+            "motion_start_time": segment.start / segment.fps,
+            "face_offset": self.face_offset,
+            "control_period": CONTROL_PERIOD,
+            "prediction_period": FRAME_PERIOD,
+            "phase_names": list(self.phase_names),
+            "joint_names": self.joint_names,
+            "action_names": self.action_names,
+            "xml_hash": self.xml_hash,
+        }
 
     def _motion_step(self) -> int:
         """Control steps since the recorded motion started; 0 while it waits."""
@@ -316,19 +462,11 @@ def world_of(env: gymnasium.Env[Any, Any]) -> FaceEnv:
     return cast(FaceEnv, env.unwrapped)
 
 
-# Wide enough for whatever physics may do; observations are not clipped to them.
-_BOUNDS = {" position": 2.0 * np.pi, " velocity": 100.0, "t_": 60.0}
-"""rad, m; rad/s, m/s; s."""
-
-_LENGTH_BOUND = 5.0
-"""m, of everything else."""
-
-
-def observation_space(spec: ObservationSpec) -> gymnasium.spaces.Dict:
+def make_observation_space(spec: ObservationSpec, names: ObservedNames) -> gymnasium.spaces.Dict:
     """Return a ``Dict`` of float32 vectors, and of uint8 images of shape (height, width, 3)."""
     spaces: dict[str, gymnasium.Space[Any]] = {}
-    for key, names in spec.components().items():
-        high = np.array([_bound(name) for name in names], dtype=np.float32)
+    for key, elements in spec.components(names).items():
+        high = np.array([_bound(name) for name in elements], dtype=np.float32)
         spaces[key] = gymnasium.spaces.Box(-high, high)
     for key in spec.image_keys():
         spaces[key] = gymnasium.spaces.Box(0, 255, (*spec.image_size, 3), np.uint8)

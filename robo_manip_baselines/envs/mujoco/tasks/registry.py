@@ -1,42 +1,384 @@
-"""Which environments there are. Adding one is a module and a line here."""
+"""Registered tasks. Adding one is a folder with an ``ENTRY`` and a line in ``TASKS``.
+
+Another package registers a task by an entry point of the group ``robo_manip_baselines.tasks``:
+the name of the task, and ``module:ENTRY``. Importing this module imports no simulator.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Literal, Protocol
 
 import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 
-from robo_manip_baselines.runs.errors import require_choice
+from robo_manip_baselines.observation import ObservedNames
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 NAMESPACE = "robo_manip_baselines"
+ENTRY_POINTS = "robo_manip_baselines.tasks"
 
-ENVS: dict[str, tuple[str, int]] = {
-    "FeedingEnv": ("robo_manip_baselines.envs.mujoco.tasks.feeding.env:FeedingEnv", 600),
+TASKS = {
+    "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
 }
-"""Name -> entry point and steps until truncation. 600 steps of 0.02 s are 12 s."""
+"""Name of a task -> ``module:name`` of its `TaskEntry`."""
+
+Size = int | str
+AttributeKind = Literal["text", "json", "int", "float", "bool", "vector"]
+Rule = Literal["", "unit quaternion", "increasing", "not negative", "phase index"]
 
 
-def env_id(name: str) -> str:
-    """Return the Gymnasium id of an environment.
+@dataclass(frozen=True)
+class Field:
+    """Array of an episode file, a row for each control step.
+
+    Attributes:
+        name: in the file.
+        shape: sizes, or symbols of the episode format, from "T" on.
+        dtype: of the array.
+        unit: SI unit of the elements.
+        frame: in which they are expressed.
+        description: for the documentation.
+        rule: that the numbers obey.
+        since: schema version; absent from files of a lower one.
+        is_optional: whether an episode may come without.
+    """
+
+    name: str
+    shape: tuple[Size, ...]
+    dtype: str
+    unit: str
+    frame: str
+    description: str
+    rule: Rule = ""
+    since: int = 1
+    is_optional: bool = False
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """Attribute of an episode file's root group.
+
+    Attributes:
+        name: in the file.
+        kind: type of the value.
+        description: for the documentation.
+        is_derived: filled in by the writer.
+        length: of a vector.
+    """
+
+    name: str
+    kind: AttributeKind
+    description: str
+    is_derived: bool = False
+    length: int = 0
+
+
+@dataclass(frozen=True)
+class ResultColumn:
+    """Column that a task adds to result rows.
+
+    Attributes:
+        name: in ``results.jsonl``.
+        kind: ``float`` or ``vector`` of three numbers.
+        description: for the documentation.
+        is_optional: whether null is valid.
+        in_report: whether the report lists it with each episode.
+    """
+
+    name: str
+    kind: Literal["float", "vector"]
+    description: str
+    is_optional: bool = False
+    in_report: bool = False
+
+
+@dataclass(frozen=True)
+class PublishedResult:
+    """Result of a condition in a paper.
+
+    Attributes:
+        successes: number of successful trials.
+        completion_time: s, mean.
+    """
+
+    successes: int
+    completion_time: float
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Contrast between conditions that should be above a limit.
+
+    Attributes:
+        text: of the claim.
+        weights: name of a condition -> its weight in the contrast.
+        measure: what is weighted: ``success`` (rate) or ``time`` (s).
+        limit: that the contrast should exceed.
+    """
+
+    text: str
+    weights: Mapping[str, float]
+    measure: str = "success"
+    limit: float = 0.0
+
+
+@dataclass(frozen=True)
+class EpisodeFigure:
+    """Figure of a report with one panel for each condition, drawn by the task.
+
+    Attributes:
+        name: of the file.
+        title: above the figure.
+        caption: below it.
+        summary: for readers who cannot see it.
+        xlabel, ylabel: of all panels.
+        draw: draws the result rows of one condition into Matplotlib axes.
+    """
+
+    name: str
+    title: str
+    caption: str
+    summary: str
+    xlabel: str
+    ylabel: str
+    draw: Any
+
+
+@dataclass(frozen=True)
+class TaskStudy:
+    """Published results, claims and figures of a task, for benchmarks.
+
+    Attributes:
+        published: name of a condition -> result in the paper.
+        trials: of each published condition.
+        time_rounding: s, half of the last digit of published times.
+        success_table, time_table: names of the paper's tables; empty without a paper.
+        claims: in the order of the table.
+        figures: of the report.
+    """
+
+    published: Mapping[str, PublishedResult] = field(default_factory=dict)
+    trials: int = 0
+    time_rounding: float = 0.0
+    success_table: str = ""
+    time_table: str = ""
+    claims: tuple[Claim, ...] = ()
+    figures: tuple[EpisodeFigure, ...] = ()
+
+
+class Expert(Protocol):
+    """Scripted expert that acts in the environment it was made for."""
+
+    def reset(self) -> None:
+        """Start an episode; called after the environment's reset."""
+        ...
+
+    def act(self) -> NDArray[np.float32]:
+        """Return the next action."""
+        ...
+
+
+class EpisodeMetrics(Protocol):
+    """Metrics of one evaluation episode, from the ``info`` of its steps; made without arguments."""
+
+    def update(self, info: Mapping[str, Any]) -> None:
+        """Take in the ``info`` of a step."""
+        ...
+
+    def result(self, info: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+        """Return the kind of failure and the task's columns, given the ``info`` of the last step.
+
+        The kind is empty for a success.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TaskEntry:
+    """Everything that the rest of the package knows of a task.
+
+    Attributes:
+        name: as commands take it; ``env_id`` is made from it and ``version``.
+        env: ``module:class`` of the environment, a `FaceEnv`.
+        version: of the environment.
+        max_episode_steps: time limit in control steps of 0.02 s.
+        experts: name -> ``module:callable`` that makes the `Expert` of an environment; the first
+            one is the default.
+        metrics: ``module:class`` of its `EpisodeMetrics`.
+        failures: kind of failure -> description.
+        names: of target and objects in observations.
+        target_field, predicted_field: fields of an episode that hold the true target and a
+            predictor's output.
+        object_fields: fields that hold the poses of the objects, in the order of ``names.objects``.
+        fields: that the task adds to an episode file.
+        attributes: likewise.
+        columns: that it adds to result rows.
+        success, strict_success: descriptions of the two conditions.
+        success_time_limit: s after which a success counts as late in tables; None for no limit.
+        study: ``module:name`` of its `TaskStudy`; empty without one.
+        schema_version: lowest version of the episode schema that describes its files.
+    """
+
+    name: str
+    env: str
+    max_episode_steps: int
+    experts: Mapping[str, str]
+    metrics: str
+    failures: Mapping[str, str]
+    version: int = 0
+    names: ObservedNames = field(default_factory=ObservedNames)
+    target_field: str = "mouth_position"
+    predicted_field: str = "predicted_mouth"
+    object_fields: tuple[str, ...] = ()
+    fields: tuple[Field, ...] = ()
+    attributes: tuple[Attribute, ...] = ()
+    columns: tuple[ResultColumn, ...] = ()
+    success: str = ""
+    strict_success: str = ""
+    success_time_limit: float | None = None
+    study: str = ""
+    schema_version: int = 3
+
+    def __post_init__(self) -> None:
+        if len(self.names.objects) != len(self.object_fields):
+            raise ValueError(f"task {self.name}: one field for each of {self.names.objects}")
+
+    @property
+    def env_id(self) -> str:
+        """Registered id of the environment."""
+        return f"{NAMESPACE}/{self.name}-v{self.version}"
+
+    def make_expert(self, name: str, env: Any) -> Expert:
+        """Make a scripted expert for an unwrapped environment.
+
+        Raises:
+            RequestError: there is no such expert.
+        """
+        return load_part(self.experts[require_choice("expert", name, self.experts)])(env)
+
+    def make_metrics(self) -> EpisodeMetrics:
+        """Make the metrics of one episode."""
+        return load_part(self.metrics)()
+
+    def load_study(self) -> TaskStudy:
+        """Return published results, claims and figures."""
+        return load_part(self.study) if self.study else TaskStudy()
+
+
+def load_part(reference: str) -> Any:
+    """Import the object that ``module:name`` refers to."""
+    module, _, name = reference.partition(":")
+    return getattr(import_module(module), name)
+
+
+@cache
+def _references() -> dict[str, str]:
+    """Map the names of all tasks to ``module:name``, the package's own first."""
+    others = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+    return {**others, **TASKS}
+
+
+def task_names() -> list[str]:
+    """Return the names of all registered tasks."""
+    return [*TASKS, *sorted(set(_references()) - set(TASKS))]
+
+
+def task_entry(name: str) -> TaskEntry:
+    """Return the entry of a task.
 
     Raises:
-        RequestError: there is no such environment.
+        RequestError: there is no such task.
     """
-    return f"{NAMESPACE}/{require_choice('environment', name, ENVS)}-v0"
+    references = {**_references(), **TASKS}
+    return load_part(references[require_choice("environment", name, references)])
 
 
-def register_envs() -> None:
-    """Make every environment known to Gymnasium."""
-    for name, (entry_point, max_episode_steps) in ENVS.items():
-        gymnasium.register(
-            env_id(name), entry_point=entry_point, max_episode_steps=max_episode_steps
-        )
+def entry_of_id(env_id: str) -> TaskEntry:
+    """Return the entry of a registered environment id.
+
+    Raises:
+        RequestError: there is no such task, or it has another version in this release.
+    """
+    name = env_id.removeprefix(f"{NAMESPACE}/").rpartition("-v")[0]
+    entry = task_entry(name or env_id)
+    if entry.env_id != env_id:
+        raise RequestError(f"environment '{env_id}': this release has {entry.env_id}")
+    return entry
+
+
+def register_envs(names: Sequence[str] | None = None) -> None:
+    """Register the environments of tasks with Gymnasium; all of them if no names are given."""
+    for name in task_names() if names is None else names:
+        entry = task_entry(name)
+        if entry.env_id not in gymnasium.registry:
+            gymnasium.register(
+                entry.env_id, entry_point=entry.env, max_episode_steps=entry.max_episode_steps
+            )
 
 
 def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """Make an environment by its name.
+    """Make the environment of a task.
 
     Raises:
-        RequestError: there is no such environment, or an argument is not valid.
+        RequestError: there is no such task, or an argument is not valid.
     """
-    return gymnasium.make(env_id(name), **kwargs)
+    entry = task_entry(name)
+    register_envs([name])
+    return gymnasium.make(entry.env_id, **kwargs)
+
+
+FACE_FIELDS = (
+    Field(
+        "mouth_position",
+        ("T", 6, 3),
+        "float64",
+        "m",
+        "world",
+        "True mouth centre now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
+    ),
+    Field(
+        "predicted_mouth",
+        ("T", 5, 3),
+        "float64",
+        "m",
+        "world",
+        "Mouth centre k = 1…5 frames ahead as forecast by a trained predictor, its last error held "
+        "between video frames: x, y, z; only where the recorded motion holds predictions",
+        since=2,
+        is_optional=True,
+    ),
+    Field(
+        "head_orientation",
+        ("T", 4),
+        "float64",
+        "1",
+        "world",
+        "True head orientation now: quaternion w, x, y, z",
+        "unit quaternion",
+    ),
+    Field(
+        "jaw_opening",
+        ("T",),
+        "float64",
+        "m",
+        "",
+        "Distance between the middle of the inner lips, now",
+        "not negative",
+    ),
+)
+"""Fields that every task with a replayed face records."""
+
+FACE_ATTRIBUTES = (
+    Attribute("motion_clip", "text", "Clip that the face's motion was recorded from"),
+    Attribute("motion_subject", "text", "Person in that clip"),
+    Attribute("motion_start_index", "int", "First sample of the segment in the motion library"),
+    Attribute("motion_start_time", "float", "Start of the segment within its run, in s"),
+    Attribute("face_offset", "vector", "Offset of the face's base position, in m", length=3),
+)
+"""Attributes that every task with a replayed face records."""

@@ -1,0 +1,97 @@
+"""Feeding: bring a cube to the mouth of a person who moves (paper, section IV.C)."""
+
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    FACE_ATTRIBUTES,
+    FACE_FIELDS,
+    Attribute,
+    Field,
+    ResultColumn,
+    TaskEntry,
+)
+from robo_manip_baselines.observation.spec import ObservedNames
+
+_PACKAGE = "robo_manip_baselines.envs.mujoco.tasks.feeding"
+
+APPROACH_LIMIT = 6.0
+"""s after the lift within which the gripper should be at the mouth (paper, Algorithm 1, line 10).
+``is_success`` has no such limit; tables count the successes within it."""
+
+ENTRY = TaskEntry(
+    name="FeedingEnv",
+    env=f"{_PACKAGE}.env:FeedingEnv",
+    max_episode_steps=600,  # 12 s
+    experts={
+        "reactive": f"{_PACKAGE}.expert:reactive",
+        "anticipatory": f"{_PACKAGE}.expert:anticipatory",
+    },
+    metrics=f"{_PACKAGE}.metrics:FeedingMetrics",
+    failures={
+        "never_grasped": "the cube was never lifted by 0.10 m",
+        "dropped": "the cube was lifted, and lost or let go before it was at the mouth; or there "
+        "no more than one finger held it",
+        "missed_high": "the gripper brought the cube to the face, within 0.06 m of the mouth along "
+        "x, and above the mouth",
+        "missed_low": "likewise, below the mouth",
+        "missed_left": "likewise, to the person's left (world +y)",
+        "missed_right": "likewise, to the person's right (world -y)",
+        "too_late": "the episode ended with the cube in the gripper and not yet at the mouth",
+    },
+    names=ObservedNames("mouth", ("cube",)),
+    object_fields=("object_pose",),
+    fields=(
+        *FACE_FIELDS,
+        Field(
+            "object_pose",
+            ("T", 7),
+            "float64",
+            "m, 1",
+            "world",
+            "The cube: x, y, z, then quaternion w, x, y, z",
+            "unit quaternion",
+        ),
+    ),
+    attributes=(
+        *FACE_ATTRIBUTES,
+        Attribute(
+            "object_initial_pose", "vector", "Start pose of the cube, as `object_pose`", length=7
+        ),
+    ),
+    columns=(
+        ResultColumn(
+            "time_since_lift",
+            "float",
+            "s from the lift to the end of the episode; null without a lift",
+            is_optional=True,
+        ),
+        ResultColumn(
+            "closest_distance",
+            "float",
+            "m, smallest distance gripper-mouth while the lifted cube was held; null without a "
+            "lift",
+            is_optional=True,
+        ),
+        ResultColumn(
+            "closest_offset",
+            "vector",
+            "m, x, y, z of gripper minus mouth at the closest approach with the cube, nearest in "
+            "units of the tolerances; null without a lift",
+            is_optional=True,
+            in_report=True,
+        ),
+        ResultColumn(
+            "cube_offset",
+            "vector",
+            "m, cube minus mouth in the face's axes (out, across to the person's left, up) where "
+            "the lifted cube was held and its centre nearest to the mouth; null without a lift",
+            is_optional=True,
+        ),
+        ResultColumn(
+            "face_force", "float", "N, largest normal force between robot and face", in_report=True
+        ),
+    ),
+    success="the gripper brought the cube within 0.03, 0.01 and 0.01 m of the mouth",
+    strict_success="the cube let go inside the mouth, the face never touched",
+    success_time_limit=APPROACH_LIMIT,
+    study=f"{_PACKAGE}.paper:STUDY",
+    schema_version=1,
+)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -11,14 +10,15 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import CUBE_SIZE, FACE, add_cube
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
-    Facts,
-    Progress,
+    FeedingProgress,
+    Phase,
+    StepMeasurements,
     from_mouth,
     is_at_mouth,
     is_inside_mouth,
 )
-from robo_manip_baselines.observation import CAMERAS, Corruption, ObservationSpec
 
 CUBE_LOW = np.array([0.12, 0.42])
 CUBE_HIGH = np.array([0.22, 0.58])
@@ -128,7 +128,8 @@ class FeedingEnv(FaceEnv):
     | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
     None |
     | ``shadows``, ``multisamples`` | False, 0 | prettier and slower images, for videos |
-    | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle`` |
+    | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;
+    ``"human"``: MuJoCo's viewer |
 
     Raises ``RequestError``, a ``ValueError``, when an argument is not valid.
 
@@ -137,42 +138,11 @@ class FeedingEnv(FaceEnv):
     - v0: first release.
     """
 
-    def __init__(
-        self,
-        *,
-        obs: str = "baseline",
-        horizon: int = 2,
-        cameras: Sequence[str] = CAMERAS,
-        image_size: tuple[int, int] = (480, 640),
-        object_pose: bool = False,
-        arms: str = "right",
-        corruption: Corruption | Mapping[str, Any] | None = None,
-        face_motion: str = "episode",
-        clips: Sequence[str] | None = None,
-        motion_library: str | None = None,
-        shadows: bool = False,
-        multisamples: int = 0,
-        render_mode: str | None = None,
-    ) -> None:
-        super().__init__(
-            spec=ObservationSpec(
-                obs=obs,
-                horizon=horizon,
-                cameras=tuple(cameras),
-                image_size=(image_size[0], image_size[1]),
-                object_pose=object_pose,
-                arms=arms,
-                corruption=(
-                    Corruption.of(corruption) if isinstance(corruption, Mapping) else corruption
-                ),
-            ),
-            face_motion=face_motion,
-            clips=clips,
-            motion_library=motion_library,
-            shadows=shadows,
-            multisamples=multisamples,
-            render_mode=render_mode,
-        )
+    task = ENTRY
+    phase_names = tuple(phase.name.lower() for phase in Phase)
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         model = self.model
         self._cube_qpos = int(model.joint("cube").qposadr[0])
         self._cube_body = model.body("cube").id
@@ -186,12 +156,19 @@ class FeedingEnv(FaceEnv):
         """Add the red cube."""
         add_cube(scene)
 
-    def reset_objects(self, rng: np.random.Generator) -> None:
+    def reset_task(self, rng: np.random.Generator) -> None:
         """Put the cube somewhere on the table in front of the head."""
+        self.progress = FeedingProgress()
+        self._clear_contacts()
         x, y = rng.uniform(CUBE_LOW, CUBE_HIGH)
         self.data.qpos[self._cube_qpos : self._cube_qpos + 7] = (x, y, CUBE_SIZE / 2, 1, 0, 0, 0)
 
     def object_position(self) -> NDArray[np.float64]:
+        """(1, 3) m, world: centre of the cube."""
+        return self.data.xpos[self._cube_body][None].copy()
+
+    @property
+    def cube_position(self) -> NDArray[np.float64]:
         """(3,) m, world: centre of the cube."""
         return self.data.xpos[self._cube_body].copy()
 
@@ -199,41 +176,40 @@ class FeedingEnv(FaceEnv):
     def cube_offset(self) -> NDArray[np.float64]:
         """(3,) m: centre of the cube from the mouth, see ``from_mouth``."""
         axes = self.data.site_xmat[self._mouth_site].reshape(3, 3)
-        return from_mouth(self.object_position(), self.mouth_track[0], axes)
+        return from_mouth(self.cube_position, self.mouth_track[0], axes)
 
     @property
     def object_pose(self) -> NDArray[np.float64]:
         """(7,) position (m) and orientation (wxyz) of the cube, world."""
         return self.data.qpos[self._cube_qpos : self._cube_qpos + 7].copy()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Start an episode; every random choice comes from ``seed``."""
-        self.progress = Progress()
+    def simulate(self, action: NDArray[np.float32]) -> None:
+        """Apply an action for one control period, counting contacts afresh."""
         self._clear_contacts()
-        observation, _ = super().reset(seed=seed, options=options)
-        return observation, self.info()
+        super().simulate(action)
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
-        """Move for 0.02 s; see the class for what comes back."""
-        self._clear_contacts()
-        self.simulate(action)
+    def advance(self) -> tuple[float, bool]:
+        """Evaluate the task after a control step; return reward and whether it has ended."""
         before = self.progress
-        self.progress = before.advance(self._facts())
+        self.progress = before.advance(self._measure())
         if self.progress.lift_time is not None:
             self.start_motion()
         reward = float(self.progress.is_success and not before.is_success) + float(
             self.progress.is_success_strict and not before.is_success_strict
         )
         delivered = self.progress.is_success and self.progress.is_clear
-        fell = bool(self.object_position()[2] < OFF_TABLE)
-        return self.observe(), reward, delivered or fell, False, self.info()
+        return reward, delivered or bool(self.cube_position[2] < OFF_TABLE)
+
+    def task_row(self) -> dict[str, Any]:
+        """Return the present pose of the cube."""
+        return {"object_pose": self.object_pose}
+
+    def start_attributes(self) -> dict[str, Any]:
+        """Return what `FaceEnv` does, and the cube's start."""
+        return {**super().start_attributes(), "object_initial_pose": self.object_pose}
 
     def info(self) -> dict[str, Any]:
-        """What the class docstring lists under Info."""
+        """Return what the class docstring lists under Info."""
         progress = self.progress
         return {
             "is_success": progress.is_success,
@@ -248,7 +224,7 @@ class FeedingEnv(FaceEnv):
         }
 
     def watch_contacts(self) -> None:
-        """Note which fingers touch the cube, and how hard the robot touches the face."""
+        """Record which fingers touch the cube, and how hard the robot touches the face."""
         pairs = self.data.contact.geom
         on_cube = (pairs == self._cube_geom).any(axis=1)
         self._fingers_on_cube |= self._is_finger[:, pairs[on_cube]].any(axis=(1, 2))
@@ -261,14 +237,14 @@ class FeedingEnv(FaceEnv):
         self._wrench = np.zeros(6)
         self._face_force = 0.0
 
-    def _facts(self) -> Facts:
+    def _measure(self) -> StepMeasurements:
         mouth, gripper = self.mouth_track[0], self.gripper_position
         half_width, half_height = self.mouth_opening.tolist()
-        return Facts(
+        return StepMeasurements(
             time=self.time,
             is_held=bool(self._fingers_on_cube.all()),
             is_touched=bool(self._fingers_on_cube.any()),
-            cube_height=float(self.object_position()[2]),
+            cube_height=float(self.cube_position[2]),
             is_at_mouth=is_at_mouth(gripper, mouth),
             is_inside_mouth=is_inside_mouth(self.cube_offset, half_width, half_height),
             touches_face=self._face_force > 0.0,

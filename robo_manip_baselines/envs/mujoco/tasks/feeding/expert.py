@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mink
 import numpy as np
@@ -14,11 +14,11 @@ from robo_manip_baselines.envs.mujoco.expert.phases import (
     DOWN,
     Approach,
     Command,
+    ExpertPhase,
+    ExpertView,
     Follow,
     Grip,
-    Phase,
     Reach,
-    View,
     level_at,
 )
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
@@ -48,34 +48,30 @@ WITHDRAWAL = np.array([0.14, 0.0, 0.0])
 """m from the mouth to the gripper before it turns home."""
 
 
-@dataclass(frozen=True)
-class FeedingExpertConfig:
-    """What tells one scripted expert from another.
-
-    Attributes:
-        lead: s; it aims where the mouth will be this much later.
-    """
-
-    lead: float = 0.0
+ANTICIPATION = 4 * FRAME_PERIOD
+"""s by which ``anticipatory`` looks ahead."""
 
 
-EXPERTS: dict[str, FeedingExpertConfig] = {
-    "reactive": FeedingExpertConfig(),
-    "anticipatory": FeedingExpertConfig(lead=4 * FRAME_PERIOD),
-}
-"""``reactive`` is Algorithm 1 as published; ``anticipatory`` knows the recorded future."""
+def reactive(env: FeedingEnv) -> FeedingExpert:
+    """Make Algorithm 1 as published."""
+    return FeedingExpert(env)
+
+
+def anticipatory(env: FeedingEnv) -> FeedingExpert:
+    """Make the expert that knows the recorded future, and aims there."""
+    return FeedingExpert(env, lead=ANTICIPATION)
 
 
 class FeedingExpert:
-    """Feeds in the environment it is given.
+    """Scripted expert of feeding.
 
     Args:
         env: the environment, unwrapped.
-        config: see ``EXPERTS``.
+        lead: s; it aims where the mouth will be this much later.
     """
 
-    def __init__(self, env: FeedingEnv, config: FeedingExpertConfig) -> None:
-        self._env, self._config = env, config
+    def __init__(self, env: FeedingEnv, lead: float = 0.0) -> None:
+        self._env, self._lead = env, lead
         self._kinematics = ArmKinematics("right")
 
     def reset(self) -> None:
@@ -83,7 +79,7 @@ class FeedingExpert:
         self._joints = np.array(HOME_QPOS)
         home = self._kinematics.forward(self._joints)
         self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
-        self._phases = _phases(self._config, self._command)
+        self._phases = _phases(self._lead, self._command)
         self._phase = self._phases.pop(0)
         self._phase.start(self._view(), self._command)
 
@@ -100,39 +96,38 @@ class FeedingExpert:
         self._joints = self._kinematics.inverse(target, self._joints)
         return np.append(self._joints, self._command.finger).astype(np.float32)
 
-    def _view(self) -> View:
+    def _view(self) -> ExpertView:
         env = self._env
         mouth = env.mouth_track
-        return View(
-            object_position=env.object_position(),
+        return ExpertView(
+            object_position=env.cube_position,
             mouth_track=mouth,
             time_since_lift=env.progress.time_since_lift(env.time),
             is_at_mouth=is_at_mouth(env.gripper_position, mouth[0]),
         )
 
 
-def _phases(config: FeedingExpertConfig, home: Command) -> list[Phase]:
+def _phases(lead: float, home: Command) -> list[ExpertPhase]:
     """List the phases of one episode, in order."""
 
-    def above(view: View, last: Command) -> Command:
+    def above(view: ExpertView, last: Command) -> Command:
         height = np.array([0.0, 0.0, GRASP_OFFSET + CLEARANCE])
         return Command(view.object_position + height, DOWN, FINGER_OPEN)
 
-    def grasp(view: View, last: Command) -> Command:
+    def grasp(view: ExpertView, last: Command) -> Command:
         height = np.array([0.0, 0.0, GRASP_OFFSET])
         return Command(view.object_position + height, DOWN, FINGER_OPEN)
 
-    def lifted(view: View, last: Command) -> Command:
+    def lifted(view: ExpertView, last: Command) -> Command:
         return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
 
-    def standoff(view: View, last: Command) -> Command:
+    def standoff(view: ExpertView, last: Command) -> Command:
         position = view.mouth() + STANDOFF
         return Command(position, level_at(position), last.finger)
 
-    def go_home(view: View, last: Command) -> Command:
+    def go_home(view: ExpertView, last: Command) -> Command:
         return home
 
-    lead = config.lead
     return [
         # Phase 1: approach and grasp the cube.
         Reach(above),

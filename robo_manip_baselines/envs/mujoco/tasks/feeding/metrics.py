@@ -1,4 +1,4 @@
-"""Watching an episode from outside: its ``info``, step by step, and what it came to."""
+"""Metrics of a feeding episode from its ``info``, and the kind of failure."""
 
 from __future__ import annotations
 
@@ -7,34 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import failure_kind
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE, Phase
-from robo_manip_baselines.rollout.results import EpisodeResult, Offset
+
+Offset = tuple[float, float, float]
 
 CARRYING = {Phase.CARRY.name.lower(), Phase.DELIVER.name.lower()}
 """Phases from the lift of the cube until it is let go."""
 
 RELEASED = Phase.RELEASE.name.lower()
 
+REACH = 0.06
+"""m along world x from the mouth, within which a gripper has come to the face: twice the tolerance
+of Algorithm 1, line 10, so that letting go a little early does not hide that the aim was beside."""
 
-class EpisodeWatch:
-    """Gathers the facts of one episode.
 
-    Args:
-        env: name of the environment.
-        seed: of the episode.
-        motion_clip: recorded clip whose motion the face replays.
-        motion_subject: person in that clip.
-    """
+class FeedingMetrics:
+    """Closest approach and contact force of one episode; see `EpisodeMetrics`."""
 
-    def __init__(self, env: str, seed: int, motion_clip: str, motion_subject: str) -> None:
-        self._start = {
-            "env": env,
-            "seed": seed,
-            "motion_clip": motion_clip,
-            "motion_subject": motion_subject,
-        }
-        self._steps = 0
+    def __init__(self) -> None:
         self._force = 0.0
         self._distance: float | None = None
         self._offset: Offset | None = None
@@ -42,9 +32,8 @@ class EpisodeWatch:
         self._cube_offset: Offset | None = None
         self._cube_distance = np.inf
 
-    def see(self, info: Mapping[str, Any]) -> None:
+    def update(self, info: Mapping[str, Any]) -> None:
         """Take in the ``info`` of a step."""
-        self._steps += 1
         self._force = max(self._force, float(info["face_force"]))
         if info["phase"] not in CARRYING:
             return
@@ -53,37 +42,56 @@ class EpisodeWatch:
         self._distance = distance if self._distance is None else min(distance, self._distance)
         nearness = float(np.linalg.norm(offset / MOUTH_TOLERANCE))
         if nearness < self._nearness:
-            self._nearness = nearness
-            x, y, z = offset.tolist()
-            self._offset = (x, y, z)
+            self._nearness, self._offset = nearness, _offset(offset)
         cube_distance = float(np.linalg.norm(info["cube_offset"]))
         if cube_distance < self._cube_distance:
-            self._cube_distance = cube_distance
-            out, across, up = np.asarray(info["cube_offset"]).tolist()
-            self._cube_offset = (out, across, up)
+            self._cube_distance, self._cube_offset = cube_distance, _offset(info["cube_offset"])
 
-    def result(self, info: Mapping[str, Any]) -> EpisodeResult:
-        """Return what the episode came to, given the ``info`` of its last step."""
-        is_success = bool(info["is_success"])
-        return EpisodeResult(
-            **self._start,
-            is_success=is_success,
-            is_success_strict=bool(info["is_success_strict"]),
-            completion_time=_seconds(info["completion_time"]),
-            time_since_lift=_seconds(info["time_since_lift"]),
-            steps=self._steps,
-            failure=failure_kind(
-                is_success=is_success,
-                was_released=info["phase"] == RELEASED,
-                closest_offset=self._offset,
-            ),
-            closest_distance=self._distance,
+    def result(self, info: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+        """Return the kind of failure and the columns of the result row."""
+        failure = failure_kind(
+            is_success=bool(info["is_success"]),
+            was_released=info["phase"] == RELEASED,
             closest_offset=self._offset,
-            cube_offset=self._cube_offset,
-            face_force=self._force,
         )
+        time = info["time_since_lift"]
+        return failure, {
+            # Times are sums of 0.02 s; microseconds hide what floating point adds to them.
+            "time_since_lift": None if time is None else round(float(time), 6),
+            "closest_distance": self._distance,
+            "closest_offset": self._offset,
+            "cube_offset": self._cube_offset,
+            "face_force": self._force,
+        }
 
 
-def _seconds(value: float | None) -> float | None:
-    """Times are sums of 0.02 s; microseconds hide what floating point adds to them."""
-    return None if value is None else round(float(value), 6)
+def failure_kind(
+    *, is_success: bool, was_released: bool, closest_offset: tuple[float, float, float] | None
+) -> str:
+    """Return the kind of failure of an episode; ``""`` for a success.
+
+    The closest approach counts. A gripper that has come to the face and is beside the mouth
+    has missed it, to the side where it is farthest; letting go there is part of the miss.
+
+    Args:
+        is_success: as in ``info``.
+        was_released: the lifted cube was let go of, or lost, before the episode ended.
+        closest_offset: (x, y, z) m, world, gripper minus mouth, at the closest approach with the
+            cube; None if it was never lifted.
+    """
+    if is_success:
+        return ""
+    if closest_offset is None:
+        return "never_grasped"
+    is_within = np.abs(closest_offset) < MOUTH_TOLERANCE
+    out, across, up = closest_offset
+    if is_within[1:].all() or abs(out) >= REACH:
+        return "dropped" if was_released or is_within.all() else "too_late"
+    if abs(up) >= abs(across):
+        return "missed_high" if up > 0.0 else "missed_low"
+    return "missed_left" if across > 0.0 else "missed_right"
+
+
+def _offset(vector: Any) -> Offset:
+    x, y, z = np.asarray(vector).tolist()
+    return x, y, z

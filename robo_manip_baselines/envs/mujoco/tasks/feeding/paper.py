@@ -1,4 +1,4 @@
-"""What the paper reports of the feeding task: Tables IV and V.
+"""The paper's results of the feeding task (Tables IV and V), its claims, and figures of reports.
 
 *Improving Robotic Imitation Learning with Predicted Facial Motion Using Transformers*. Each
 configuration was evaluated in 50 independent trials (section IV.C). The paper gives rates in per
@@ -7,57 +7,158 @@ cent, all of them whole counts of 50, and mean times to a tenth of a second, wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from robo_manip_baselines.benchmark.statistics.conditions import PAPER_ERROR, PAPER_HORIZONS
+import numpy as np
 
-TRIALS = 50
-"""for each configuration (section IV.C)."""
+from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import REACH
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    Claim,
+    EpisodeFigure,
+    PublishedResult,
+    TaskStudy,
+)
 
-TIME_ROUNDING = 0.05
-"""s, half of the last digit of the times in Table V."""
+PAPER_ERROR = "uniform"
+"""Error that is the paper's "with error": uniform within the bounds of its equations 6 and 7."""
 
+PAPER_HORIZONS = range(1, 6)
+"""Frames of 1/30 s, Tables IV and V."""
 
-@dataclass(frozen=True)
-class PaperResult:
-    """A row of Tables IV and V.
+LITTLE = 0.10
+"""Rate that errors may cost and still be said to cost little. The paper's own cost 0.05."""
 
-    Attributes:
-        successes: of ``TRIALS`` (Table IV).
-        completion_time: s, mean (Table V).
-    """
-
-    successes: int
-    completion_time: float
-
-    @property
-    def rate(self) -> float:
-        """Share of successes."""
-        return self.successes / TRIALS
-
+_LITTLE = f"(less than {100 * LITTLE:.0f} points)"
 
 _WITHOUT_ERROR = (
-    PaperResult(33, 4.6),  # 66 %
-    PaperResult(37, 4.3),  # 74 %
-    PaperResult(36, 4.4),  # 72 %
-    PaperResult(34, 4.4),  # 68 %
-    PaperResult(30, 4.5),  # 60 %
+    PublishedResult(33, 4.6),  # 66 %
+    PublishedResult(37, 4.3),  # 74 %
+    PublishedResult(36, 4.4),  # 72 %
+    PublishedResult(34, 4.4),  # 68 %
+    PublishedResult(30, 4.5),  # 60 %
 )
 _WITH_ERROR = (
-    PaperResult(29, 4.7),  # 58 %
-    PaperResult(36, 4.3),  # 72 %
-    PaperResult(34, 4.5),  # 68 %
-    PaperResult(31, 4.5),  # 62 %
-    PaperResult(27, 4.6),  # 54 %
+    PublishedResult(29, 4.7),  # 58 %
+    PublishedResult(36, 4.3),  # 72 %
+    PublishedResult(34, 4.5),  # 68 %
+    PublishedResult(31, 4.5),  # 62 %
+    PublishedResult(27, 4.6),  # 54 %
 )
 
-PAPER: dict[str, PaperResult] = {
-    "baseline": PaperResult(21, 4.9),  # 42 %
-    "current": PaperResult(30, 4.6),  # 60 %
-    **{f"current_pred_h{h}": r for h, r in zip(PAPER_HORIZONS, _WITHOUT_ERROR, strict=True)},
-    **{
-        f"current_pred_h{h}_{PAPER_ERROR}": r
-        for h, r in zip(PAPER_HORIZONS, _WITH_ERROR, strict=True)
+
+def _h(horizon: int, error: str = "") -> str:
+    return f"current_pred_h{horizon}{error}"
+
+
+_OTHERS = tuple(h for h in PAPER_HORIZONS if h not in (2, 3))
+
+PAPER_CLAIMS = (
+    Claim("The present mouth position raises success", {"current": 1.0, "baseline": -1.0}),
+    Claim("A forecast of 2 frames raises it further", {_h(2): 1.0, "current": -1.0}),
+    Claim(
+        "2–3 frames are better than 1, 4 and 5",
+        {**{_h(h): 1 / 2 for h in (2, 3)}, **{_h(h): -1 / 3 for h in _OTHERS}},
+    ),
+    Claim(
+        f"Errors cost little {_LITTLE}",
+        {
+            **{_h(h, f"_{PAPER_ERROR}"): 1 / 5 for h in PAPER_HORIZONS},
+            **{_h(h): -1 / 5 for h in PAPER_HORIZONS},
+        },
+        limit=-LITTLE,
+    ),
+    Claim(
+        "2 frames are faster than the present position alone",
+        {"current": 1.0, _h(2): -1.0},
+        measure="time",
+    ),
+)
+"""Claims of the paper (section V)."""
+
+FURTHER_CLAIMS = (
+    Claim(
+        "A forecast of 2 frames is worth more than a frozen one",
+        {_h(2): 1.0, _h(2, "_persistence"): -1.0},
+    ),
+    Claim(
+        "A forecast of 2 frames is worth more than the motion of another time",
+        {_h(2): 1.0, _h(2, "_shuffled"): -1.0},
+    ),
+    Claim(
+        f"A trained predictor in place of the true future costs little {_LITTLE}",
+        {_h(2, "_model"): 1.0, _h(2): -1.0},
+        limit=-LITTLE,
+    ),
+    Claim(
+        "An expert who anticipates teaches more (4 frames)",
+        {_h(4, "_anticipatory"): 1.0, _h(4): -1.0},
+    ),
+)
+"""Claims about conditions of ``conditions/feeding.yaml`` that the paper does not have."""
+
+
+FACE_VIEW = 0.06
+"""m to every side of the mouth in the figure of arrivals."""
+
+_GREEN, _RED, _INK = "#009e73", "#d55e00", "#1f2328"
+
+
+def draw_arrivals(axes: Any, results: Sequence[Mapping[str, Any]], many: bool) -> None:
+    """Draw where on the mouth's plane the cube came nearest, seen from in front of the face.
+
+    Args:
+        axes: of Matplotlib, in mm; the person's left is on the right.
+        results: columns of the result rows of one condition, with ``is_success``.
+        many: whether there are so many points that they are drawn as pixels.
+    """
+    across, up = 1000.0 * MOUTH_TOLERANCE[1:]
+    view = 1000.0 * FACE_VIEW
+    at_face = [
+        (1000.0 * offset[1], 1000.0 * offset[2], result["is_success"])
+        for result in results
+        if (offset := result["cube_offset"]) is not None and abs(offset[0]) < REACH
+    ]
+    seen = [p for p in at_face if max(abs(p[0]), abs(p[1])) <= view]
+    for is_success, color, marker in ((False, _RED, "x"), (True, _GREEN, ".")):
+        points = np.array([p[:2] for p in seen if p[2] == is_success]).reshape(-1, 2)
+        axes.plot(*points.T, marker, color=color, ms=3.5, mew=0.7, alpha=0.7, rasterized=many)
+    box = [-across, across, across, -across, -across], [-up, -up, up, up, -up]
+    axes.plot(*box, color=_INK, lw=1.2)
+    missing = f"{len(results) - len(at_face)} not at the face"
+    if outside := len(at_face) - len(seen):
+        missing += f", {outside} outside"
+    axes.text(0.02, 0.02, missing, transform=axes.transAxes, fontsize=7)
+    axes.set(xlim=(-view, view), ylim=(-view, view), aspect="equal")
+
+
+ARRIVALS = EpisodeFigure(
+    name="arrivals",
+    title="Where on the face the cube arrived",
+    caption="The centre of the cube on the mouth's plane where, held, it was nearest to the mouth, "
+    f"if that was within {1000 * REACH:.0f} mm along the face's normal. Green dots: successes; red "
+    f"crosses: failures; the box: ±{1000 * MOUTH_TOLERANCE[1]:.0f} mm, the tolerance that "
+    "Algorithm 1 gives to the gripper behind it.",
+    summary="One scatter plot for each condition; the numbers are in the table of how episodes "
+    "ended.",
+    xlabel="across the face, mm (right: the person's left)",
+    ylabel="up, mm",
+    draw=draw_arrivals,
+)
+
+STUDY = TaskStudy(
+    published={
+        "baseline": PublishedResult(21, 4.9),  # 42 %
+        "current": PublishedResult(30, 4.6),  # 60 %
+        **{_h(h): r for h, r in zip(PAPER_HORIZONS, _WITHOUT_ERROR, strict=True)},
+        **{_h(h, f"_{PAPER_ERROR}"): r for h, r in zip(PAPER_HORIZONS, _WITH_ERROR, strict=True)},
     },
-}
-"""Name of the arm -> what the paper reports of it."""
+    trials=50,
+    time_rounding=0.05,
+    success_table="Table IV",
+    time_table="Table V",
+    claims=PAPER_CLAIMS + FURTHER_CLAIMS,
+    figures=(ARRIVALS,),
+)
+"""Counts of Table IV (of 50) and mean times of Table V, by the name of the condition."""

@@ -1,4 +1,4 @@
-"""When feeding has succeeded: predicates on geometry, and how far an episode has come."""
+"""Success of feeding: predicates on geometry, and the progress of an episode."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CLEAR_DISTANCE = 0.12
 
 
 class Phase(enum.IntEnum):
-    """How far the task has come. Only ever moves on, except back to REACH before the lift."""
+    """Phase of the task. Only ever advances, except back to REACH before the lift."""
 
     REACH = 0
     GRASP = 1
@@ -63,7 +63,7 @@ def from_mouth(
 def is_inside_mouth(
     cube_offset: NDArray[np.float64], half_width: float, half_height: float
 ) -> bool:
-    """Whether the centre of the cube is in the mouth opening, past the front of the lips.
+    """Return whether the centre of the cube is in the mouth opening, past the front of the lips.
 
     Args:
         cube_offset: (3,) m, its centre from the mouth, see ``from_mouth``.
@@ -77,8 +77,8 @@ def is_inside_mouth(
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What a control step found out.
+class StepMeasurements:
+    """Measurements of one control step.
 
     Attributes:
         time: s since the start of the episode.
@@ -102,8 +102,8 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What has happened so far in an episode; ``advance`` gives the next.
+class FeedingProgress:
+    """Events of an episode so far; ``advance`` returns the next.
 
     Attributes:
         phase: see ``Phase``.
@@ -144,36 +144,36 @@ class Progress:
         """s since the lift; None before."""
         return None if self.lift_time is None else time - self.lift_time
 
-    def advance(self, facts: Facts) -> Progress:
-        """Take in what one control step found out."""
+    def advance(self, step: StepMeasurements) -> FeedingProgress:
+        """Take in the measurements of one control step."""
         lift_time = self.lift_time
-        if lift_time is None and facts.is_held and facts.cube_height >= LIFT_HEIGHT:
-            lift_time = facts.time
+        if lift_time is None and step.is_held and step.cube_height >= LIFT_HEIGHT:
+            lift_time = step.time
         lifted = lift_time is not None
         success_time = self.success_time
-        if success_time is None and lifted and facts.is_held and facts.is_at_mouth:
-            success_time = facts.time
+        if success_time is None and lifted and step.is_held and step.is_at_mouth:
+            success_time = step.time
         release_time, released_inside = self.release_time, self.released_inside
-        if release_time is None and lifted and not facts.is_touched:
-            release_time, released_inside = facts.time, facts.is_inside_mouth
+        if release_time is None and lifted and not step.is_touched:
+            release_time, released_inside = step.time, step.is_inside_mouth
         released = release_time is not None
         return replace(
             self,
-            phase=_phase(facts, lifted, success_time is not None, released),
+            phase=_phase(step, lifted, success_time is not None, released),
             lift_time=lift_time,
             success_time=success_time,
             release_time=release_time,
-            touched_face=self.touched_face or (lifted and facts.touches_face),
+            touched_face=self.touched_face or (lifted and step.touches_face),
             released_inside=released_inside,
-            is_clear=self.is_clear or (released and facts.gripper_distance >= CLEAR_DISTANCE),
+            is_clear=self.is_clear or (released and step.gripper_distance >= CLEAR_DISTANCE),
         )
 
 
-def _phase(facts: Facts, lifted: bool, succeeded: bool, released: bool) -> Phase:
+def _phase(step: StepMeasurements, lifted: bool, succeeded: bool, released: bool) -> Phase:
     if released:
         return Phase.RELEASE
     if succeeded:
         return Phase.DELIVER
     if lifted:
         return Phase.CARRY
-    return Phase.GRASP if facts.is_held else Phase.REACH
+    return Phase.GRASP if step.is_held else Phase.REACH
