@@ -82,11 +82,10 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     )
     options = _parse(options, list(args), description)
     config = dataclasses.replace(options.run, preset=preset)
-    if options.corruption:
-        return config
-    return dataclasses.replace(
-        config, spec=dataclasses.replace(config.spec, corruption=Corruption())
-    )
+    if not options.corruption:
+        spec = dataclasses.replace(config.spec, corruption=Corruption())
+        config = dataclasses.replace(config, spec=spec)
+    return config
 
 
 def _parse(options: TrainOptions[Any], args: list[str], description: str) -> TrainOptions[Any]:
@@ -123,7 +122,7 @@ def _apply_yaml(
     file: Path, values: Mapping[str, Any], options: TrainOptions[Any]
 ) -> TrainOptions[Any]:
     """Parse a file's values as if they had been typed, so that they are checked the same way."""
-    known = [name for name in options.run.to_json() if name != "out"] + ["corruption"]
+    known = [*options.run.to_json(), "corruption"]
     args = [options.run.policy]
     try:
         for name, value in values.items():

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomllib
 import torch
 
 from robo_manip_baselines.commands import rollout as rollout_command
@@ -19,8 +18,9 @@ from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
 from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.registry import ENTRY_POINT_GROUP, policy_entry, policy_names
+from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording, rollout
-from robo_manip_baselines.rollout.workers import EnvConfig
+from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.errors import RequestError
 
 SHORT = {
@@ -45,16 +45,12 @@ def package(page: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pat
         path = folder / code.partition("\n")[0].removeprefix("# ")
         path.parent.mkdir(exist_ok=True)
         path.write_text(code)
-    (project,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
-    points = tomllib.loads(project)["project"]["entry-points"]
-    text = "".join(
-        f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in entries.items())
-        for group, entries in points.items()
-    )
+    pattern = r'\[project\.entry-points\."(.+)"\]\n(\w+) = "(.+)"\n'
+    (point,) = re.findall(pattern, page)
     info = folder / "my_policy-0.1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_policy\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text(text)
+    (info / "entry_points.txt").write_text("[{}]\n{} = {}\n".format(*point))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
         yield folder

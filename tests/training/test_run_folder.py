@@ -61,7 +61,7 @@ def test_the_previous_releases_files_read_as_the_same_configuration() -> None:
     read = TrainConfig.from_json({**older, **given}).spec.corruption
     assert read == Corruption("uniform", face_dropout_length=4.0)
     off = TrainConfig.from_json({**older, **given, "corruption": False})
-    assert off.spec.corruption is None
+    assert not off.spec.corruption
     assert TrainConfig.from_json({**older, "cameras": ["none"]}) == MLP
 
 
