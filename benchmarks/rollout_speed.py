@@ -80,7 +80,7 @@ def policy_for(options: Options, num_envs: int) -> Policy:
     if options.checkpoint is None:
         return Still()
     from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
-    from robo_manip_baselines.policy.execution import ChunkPolicy
+    from robo_manip_baselines.policy.execution import PolicyRunner
     from robo_manip_baselines.training.device import choose_device
 
     checkpoint, device = read_checkpoint(options.checkpoint), choose_device("auto")
@@ -88,12 +88,12 @@ def policy_for(options: Options, num_envs: int) -> Policy:
         import torch
 
         torch.set_num_threads(1)  # as Rollout.py does
-    return ChunkPolicy(
+    return PolicyRunner(
         load_model(checkpoint, device),
         checkpoint.spec,
         checkpoint.normalization,
-        checkpoint.acting,
-        slots=num_envs,
+        checkpoint.execution,
+        num_envs=num_envs,
         device=device,
     )
 
