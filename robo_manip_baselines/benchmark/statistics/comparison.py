@@ -1,8 +1,6 @@
-"""Arms against one another on common seeds, and against the paper's counts.
+"""Conditions compared with one another on common seeds, and with published results.
 
-Legend: R training seeds, E evaluation seeds that both arms have.
-
-Tests give None where there is nothing to test; `holm` passes that on.
+Legend: R training seeds, E evaluation seeds that both conditions have.
 """
 
 from __future__ import annotations
@@ -14,91 +12,47 @@ from typing import Any
 
 import numpy as np
 
-from robo_manip_baselines.benchmark.statistics.intervals import (
-    RESAMPLES,
-    Estimate,
-    mean_estimate,
-)
+from robo_manip_baselines.benchmark.statistics.intervals import RESAMPLES, Estimate, mean_estimate
 from robo_manip_baselines.benchmark.statistics.outcomes import Floats
-from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import TIME_ROUNDING, TRIALS, PaperResult
+from robo_manip_baselines.envs.mujoco.tasks.registry import PublishedResult
 from robo_manip_baselines.rollout.results import CONFIDENCE
 
 SIGNIFICANCE = round(1.0 - CONFIDENCE, 9)
-"""A smaller p-value, after Holm's correction, is called a difference."""
+"""Holm-corrected p-values below it are called significant."""
 
 
 @dataclass(frozen=True)
-class PairedSuccess:
-    """Success of an arm against another's, episode by episode.
+class Comparison:
+    """Success rate or mean completion time of a condition against another one.
 
     Attributes:
-        difference: of the rates, this arm minus the other.
-        wins: episodes that only this arm managed.
-        losses: episodes that only the other arm managed.
-        p: of McNemar's exact test.
-    """
-
-    difference: Estimate
-    wins: int
-    losses: int
-    p: float | None
-
-
-@dataclass(frozen=True)
-class PairedTimes:
-    """Completion times of an arm against another's, over episodes that both managed.
-
-    Attributes:
-        difference: s, mean of this arm minus the other.
-        p: of Wilcoxon's signed-rank test.
+        difference: this condition minus the other; rates, or s.
+        p: of the test; None without data to test.
+        p_holm: Holm-corrected over the conditions of a benchmark; None before that.
+        wins: of success rates on common seeds: episodes in which only this condition succeeded.
+        losses: likewise, only the other.
     """
 
     difference: Estimate
     p: float | None
+    p_holm: float | None = None
+    wins: int = 0
+    losses: int = 0
 
 
-@dataclass(frozen=True)
-class PaperSuccess:
-    """Success of an arm against the paper's count.
-
-    Attributes:
-        paper: what the paper reports.
-        difference: our rate minus the paper's, with Newcombe's interval.
-        p: of Fisher's exact test on the two counts.
-    """
-
-    paper: PaperResult
-    difference: Estimate
-    p: float | None
-
-
-@dataclass(frozen=True)
-class PaperTime:
-    """Completion time of an arm against the paper's mean.
-
-    Attributes:
-        paper: what the paper reports.
-        difference: s, our mean minus the paper's.
-        p: of Student's t-test, see ``time_against_paper``.
-    """
-
-    paper: PaperResult
-    difference: Estimate
-    p: float | None
+NO_COMPARISON = Comparison(Estimate(None, None, None, 0), None)
+"""of a condition that there is nothing to compare with."""
 
 
 def paired_success(
     ours: Floats, theirs: Floats, rng: np.random.Generator, resamples: int = RESAMPLES
-) -> PairedSuccess:
-    """Compare successes.
+) -> Comparison:
+    """Compare success rates by McNemar's exact test on pairs of episodes.
 
     The interval is a bootstrap over the common seeds, hierarchical with several training seeds.
-    Where no episode tells the arms apart, a bootstrap would claim to know the difference exactly;
-    the interval is then that of Clopper and Pearson for a kind of episode seen 0 times in n,
-    in both directions.
+    Without any differing episode, a bootstrap has no width; see `bound_unseen`.
 
-    McNemar's test is about the policies that were trained: with several training seeds it takes
-    them as they are, and says nothing about others.
+    McNemar's test takes the training runs as given: it is about the trained policies.
 
     Args:
         ours: (R, E) 1, 0 or NaN.
@@ -109,19 +63,22 @@ def paired_success(
     difference = mean_estimate(ours - theirs, rng, resamples)
     wins, losses = int((ours > theirs).sum()), int((ours < theirs).sum())
     if difference.n == 0:
-        return PairedSuccess(difference, wins, losses, None)
+        return Comparison(difference, None)
     from statsmodels.stats.contingency_tables import mcnemar  # slow to import
 
     if wins == losses == 0:
-        difference = not_seen(difference)
+        difference = bound_unseen(difference)
     both = int(((ours == 1.0) & (theirs == 1.0)).sum())
     neither = difference.n - both - wins - losses
     test: Any = mcnemar([[both, wins], [losses, neither]], exact=True)
-    return PairedSuccess(difference, wins, losses, float(test.pvalue))
+    return Comparison(difference, float(test.pvalue), wins=wins, losses=losses)
 
 
-def not_seen(difference: Estimate) -> Estimate:
-    """Return a difference of rates that no episode showed with Clopper and Pearson's bounds."""
+def bound_unseen(difference: Estimate) -> Estimate:
+    """Return a difference of rates without any differing episode with Clopper and Pearson's bounds.
+
+    They are those of an event seen 0 times in n, in both directions.
+    """
     from statsmodels.stats.proportion import proportion_confint  # slow to import
 
     ends: Any = proportion_confint(0, difference.n, alpha=SIGNIFICANCE, method="beta")
@@ -130,8 +87,8 @@ def not_seen(difference: Estimate) -> Estimate:
 
 def paired_times(
     ours: Floats, theirs: Floats, rng: np.random.Generator, resamples: int = RESAMPLES
-) -> PairedTimes:
-    """Compare completion times over the episodes that both arms managed.
+) -> Comparison:
+    """Compare completion times, where both succeeded, by Wilcoxon's signed-rank test.
 
     Args:
         ours: (R, E) s, NaN without success.
@@ -143,76 +100,75 @@ def paired_times(
     grid = np.round(ours - theirs, 6)
     differences = grid[np.isfinite(grid)]
     estimate = mean_estimate(grid, rng, resamples)
-    if not differences.size:
-        return PairedTimes(estimate, None)
     if not differences.any():
-        return PairedTimes(estimate, 1.0)
+        return Comparison(estimate, 1.0 if differences.size else None)
     from scipy.stats import wilcoxon  # slow to import
 
     test: Any = wilcoxon(differences, zero_method="pratt")
-    return PairedTimes(estimate, float(test.pvalue))
+    return Comparison(estimate, float(test.pvalue))
 
 
-def against_paper(successes: int, episodes: int, paper: PaperResult) -> PaperSuccess:
-    """Compare a count with the paper's.
+def compare_published_success(
+    successes: int, episodes: int, published: PublishedResult, trials: int
+) -> Comparison:
+    """Compare a count with a published one by Fisher's exact test; the interval is Newcombe's.
 
     Args:
         successes: ours.
         episodes: ours.
-        paper: theirs, of ``TRIALS``.
+        published: theirs.
+        trials: theirs.
     """
     if not episodes:
-        return PaperSuccess(paper, Estimate(None, None, None, 0), None)
+        return NO_COMPARISON
     from scipy.stats import fisher_exact  # slow to import
     from statsmodels.stats.proportion import confint_proportions_2indep
 
-    counts = [
-        [successes, episodes - successes],
-        [paper.successes, TRIALS - paper.successes],
-    ]
-    test: Any = fisher_exact(counts)
+    theirs = published.successes
+    test: Any = fisher_exact([[successes, episodes - successes], [theirs, trials - theirs]])
     ends: Any = confint_proportions_2indep(
-        successes,
-        episodes,
-        paper.successes,
-        TRIALS,
+        *(successes, episodes, theirs, trials),
         method="newcomb",
         compare="diff",
         alpha=SIGNIFICANCE,
     )
-    difference = successes / episodes - paper.rate
-    return PaperSuccess(
-        paper, Estimate(difference, float(ends[0]), float(ends[1]), episodes), float(test.pvalue)
+    difference = successes / episodes - theirs / trials
+    return Comparison(
+        Estimate(difference, float(ends[0]), float(ends[1]), episodes), float(test.pvalue)
     )
 
 
-def time_against_paper(times: Floats, paper: PaperResult) -> PaperTime:
-    """Compare a mean completion time with the paper's, which comes without a spread.
+def compare_published_time(
+    times: Floats, published: PublishedResult, rounding: float
+) -> Comparison:
+    """Compare a mean completion time with a published one that comes without a spread.
 
-    The paper's times are taken to spread as ours do, over as many successes as its Table IV says:
-    Student's t-test from means and standard deviations. Half of the last digit that the paper gives
-    is allowed for on both sides.
+    Published times are assumed to spread as ours do, over as many successes as are published:
+    Student's t-test from means and standard deviations, with an allowance for rounding.
 
     Args:
         times: s, any shape, NaN without success.
-        paper: theirs.
+        published: theirs.
+        rounding: s, half of the last digit of published times.
     """
     found = times[np.isfinite(times)]
     n = found.size
     if not n:
-        return PaperTime(paper, Estimate(None, None, None, 0), None)
-    difference = float(found.mean()) - paper.completion_time
+        return NO_COMPARISON
+    difference = float(found.mean()) - published.completion_time
     deviation = float(found.std(ddof=1)) if n > 1 else 0.0
     if deviation == 0.0:
-        return PaperTime(paper, Estimate(difference, None, None, n), None)
+        return Comparison(Estimate(difference, None, None, n), None)
     from scipy.stats import t, ttest_ind_from_stats  # slow to import
 
-    error = deviation * math.sqrt(1.0 / n + 1.0 / paper.successes)
-    half = float(t.ppf(0.5 + CONFIDENCE / 2.0, n + paper.successes - 2)) * error + TIME_ROUNDING
-    least = max(abs(difference) - TIME_ROUNDING, 0.0)
-    test: Any = ttest_ind_from_stats(least, deviation, n, 0.0, deviation, paper.successes)
-    estimate = Estimate(difference, difference - half, difference + half, n)
-    return PaperTime(paper, estimate, float(test.pvalue))
+    theirs = published.successes
+    error = deviation * math.sqrt(1.0 / n + 1.0 / theirs)
+    half = float(t.ppf(0.5 + CONFIDENCE / 2.0, n + theirs - 2)) * error + rounding
+    least = max(abs(difference) - rounding, 0.0)
+    test: Any = ttest_ind_from_stats(least, deviation, n, 0.0, deviation, theirs)
+    return Comparison(
+        Estimate(difference, difference - half, difference + half, n), float(test.pvalue)
+    )
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -225,3 +181,9 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     found: Any = multipletests(tested, alpha=SIGNIFICANCE, method="holm")
     corrected = iter(found[1].tolist())
     return [None if p is None else next(corrected) for p in p_values]
+
+
+def correct_comparisons(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """Set the Holm-corrected p-values of comparisons of one kind."""
+    corrected = holm([comparison.p for comparison in comparisons])
+    return [replace(c, p_holm=p) for c, p in zip(comparisons, corrected, strict=True)]

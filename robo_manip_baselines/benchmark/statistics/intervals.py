@@ -1,21 +1,20 @@
-"""Means with 95 % intervals.
+"""Means and rates with 95 % intervals.
 
 Legend: N values, R training seeds, E evaluation seeds, B resamples.
 
-Episodes of one training run are independent: their share of successes has Wilson's interval.
-Episodes of several are not, for the runs share evaluation seeds: only a bootstrap over both kinds
-of seeds is honest then.
+Episodes of one training run are independent: their success rate has Wilson's interval. Episodes of
+several are not, because the runs share evaluation seeds: both kinds of seeds are resampled then.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from robo_manip_baselines.benchmark.statistics.outcomes import Floats
-from robo_manip_baselines.rollout.results import CONFIDENCE, Share, share
+from robo_manip_baselines.rollout.results import CONFIDENCE, Proportion
 
 RESAMPLES = 9999
 """of each bootstrap: the ends of an interval repeat to about a fiftieth of its width."""
@@ -23,12 +22,12 @@ RESAMPLES = 9999
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean with its interval.
+    """Mean with its interval.
 
     Attributes:
         mean: None without any value.
-        low, high: ends of the 95 % interval; None where the data cannot tell.
-        n: values that it is the mean of.
+        low, high: ends of the 95 % interval; None without enough values.
+        n: number of values.
     """
 
     mean: float | None
@@ -50,11 +49,11 @@ def mean_estimate(grid: Floats, rng: np.random.Generator, resamples: int = RESAM
     return bootstrap_mean(grid[np.isfinite(grid)], rng, resamples)
 
 
-def rate_estimate(grid: Floats, rng: np.random.Generator, resamples: int = RESAMPLES) -> Share:
-    """Return the share of ones in a grid, with the interval that fits its training seeds.
+def rate_estimate(grid: Floats, rng: np.random.Generator, resamples: int = RESAMPLES) -> Proportion:
+    """Return the rate of ones in a grid, with the interval that fits its number of training seeds.
 
-    Wilson's for one training seed, the hierarchical bootstrap for several. Outcomes that are all
-    the same leave nothing to resample; they have Wilson's interval of a single run then.
+    Wilson's for one training seed, the hierarchical bootstrap for several. Where all outcomes are
+    the same there is nothing to resample: the interval is then Wilson's for a single run.
 
     Args:
         grid: (R, E) 1, 0 or NaN.
@@ -64,13 +63,13 @@ def rate_estimate(grid: Floats, rng: np.random.Generator, resamples: int = RESAM
     is_there = np.isfinite(grid)
     count, n = int(np.nansum(grid)), int(is_there.sum())
     if is_there.any(axis=1).sum() < 2:
-        return share(count, n)
+        return Proportion.of(count, n)
     if count in (0, n):
         columns = int(is_there.any(axis=0).sum())
-        alone = share(columns if count else 0, columns)
-        return Share(count, count / n, alone.low, alone.high)
+        single = Proportion.of(columns if count else 0, columns)
+        return replace(single, count=count, rate=count / n)
     found = hierarchical_mean(grid, rng, resamples)
-    return Share(count, found.mean, found.low, found.high)
+    return Proportion(count, found.mean, found.low, found.high)
 
 
 def bootstrap_mean(
@@ -78,8 +77,7 @@ def bootstrap_mean(
 ) -> Estimate:
     """Return the mean of independent values with its bias-corrected and accelerated interval.
 
-    One value has no interval. Values that are all the same have an interval of no width: so far as
-    the data tell, there is no spread.
+    One value has no interval. Values that are all the same have an interval of no width.
 
     Args:
         values: (N,).
@@ -114,15 +112,15 @@ def hierarchical_mean(
 ) -> Estimate:
     """Return the mean over training and evaluation seeds, with an interval for both.
 
-    The percentile interval of `hierarchical_means`. Where there are few training seeds it is too
-    narrow, for R seeds show about (R - 1)/R of their variance.
+    The percentile interval of `hierarchical_means`. With few training seeds it is too narrow: a
+    sample of R seeds has about (R - 1)/R of their variance.
     """
     n = int(np.isfinite(grid).sum())
     if n < 2:
         return bootstrap_mean(grid[np.isfinite(grid)], rng, resamples)
     means = hierarchical_means(grid, rng, resamples)
     tail = 50.0 * (1.0 - CONFIDENCE)
-    # A resample of nothing but gaps says nothing.
+    # A resample may hit gaps only; it has no mean.
     low, high = np.nanpercentile(means, [tail, 100.0 - tail])
     return Estimate(float(np.nanmean(grid)), float(low), float(high), n)
 
@@ -130,8 +128,8 @@ def hierarchical_mean(
 def hierarchical_means(grid: Floats, rng: np.random.Generator, resamples: int) -> Floats:
     """Resample training seeds, then the evaluation seeds that they share, and take means.
 
-    All training seeds of a resample are evaluated on the same resampled evaluation seeds, as they
-    were in truth: an easy episode is easy for all of them.
+    All training seeds of a resample share its evaluation seeds, as they do in the data: an easy
+    episode is easy for all of them.
 
     Args:
         grid: (R, E), NaN where there is no value.
@@ -142,7 +140,7 @@ def hierarchical_means(grid: Floats, rng: np.random.Generator, resamples: int) -
         (B,) means; NaN for a resample without any value.
     """
     R, E = grid.shape
-    # How often each seed is drawn says all: a mean does not know the order.
+    # Counts of each seed are enough: the order does not matter to a mean.
     rows_BR = rng.multinomial(R, np.full(R, 1.0 / R), size=resamples).astype(np.float64)
     columns_BE = rng.multinomial(E, np.full(E, 1.0 / E), size=resamples).astype(np.float64)
     is_there = np.isfinite(grid)
