@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robo_manip_baselines.benchmark.statistics.comparison import (
-    NO_COMPARISON,
-    Comparison,
-    bound_unseen,
-    compare_published_success,
-    compare_published_time,
-    correct_comparisons,
-    paired_success,
-    paired_times,
-)
 from robo_manip_baselines.benchmark.statistics.conditions import (
     CURRENT,
     ConditionDescription,
     describe_condition,
     sort_conditions,
 )
-from robo_manip_baselines.benchmark.statistics.intervals import (
+from robo_manip_baselines.benchmark.statistics.inference import (
+    NO_COMPARISON,
     RESAMPLES,
+    Comparison,
     Estimate,
+    bound_unseen,
+    holm,
     mean_estimate,
+    paired_success,
+    paired_times,
+    proportion,
+    published_success,
+    published_time,
     rate_estimate,
 )
 from robo_manip_baselines.benchmark.statistics.outcomes import (
+    Floats,
     OutcomeMatrix,
     ResultRow,
     on_common_seeds,
@@ -191,82 +191,64 @@ def analyze(
     study = task.load_study()
     outcomes = {name: outcome_matrix(own) for name, own in grouped.items()}
 
+    limit = task.success_time_limit
+
     def rng(name: str, measure: str) -> np.random.Generator:
-        return np.random.default_rng([seed, zlib.crc32(f"{name}/{measure}".encode())])
+        return _generator(seed, f"{name}/{measure}")
 
     def statistics_of(condition: ConditionDescription) -> ConditionStatistics:
-        name, own, limit = condition.name, outcomes[condition.name], task.success_time_limit
-        found = ConditionStatistics(
-            condition=condition,
-            rows=tuple(grouped[name]),
-            outcomes=own,
-            success=rate_estimate(own.success, rng(name, "success"), resamples),
-            strict=rate_estimate(own.strict, rng(name, "strict"), resamples),
-            within_limit=None
-            if limit is None
-            else rate_estimate(own.success_within(limit), rng(name, "in time"), resamples),
-            success_by_seed={
-                train_seed: Proportion.of(int(np.nansum(row)), int(np.isfinite(row).sum()))
-                for train_seed, row in zip(own.train_seeds, own.success, strict=True)
-            },
+        name = condition.name
+        own, published = outcomes[name], study.published.get(name)
+
+        def rate(grid: Floats, measure: str) -> Proportion:
+            return rate_estimate(grid, rng(name, measure), resamples)
+
+        def difference(compare: Callable[..., Comparison], measure: str) -> Comparison:
+            if name == reference:
+                return NO_COMPARISON
+            ours, theirs = on_common_seeds([own, outcomes[reference]], measure)
+            return compare(ours, theirs, rng(name, f"{measure} difference"), resamples)
+
+        success = rate(own.success, "success")
+        return ConditionStatistics(
+            condition,
+            tuple(grouped[name]),
+            own,
+            success,
+            strict=rate(own.strict, "strict"),
+            within_limit=None if limit is None else rate(own.success_within(limit), "in time"),
+            success_by_seed=dict(zip(own.train_seeds, map(proportion, own.success), strict=True)),
             time=mean_estimate(own.time, rng(name, "time"), resamples),
             time_by_seed={
                 train_seed: float(np.nanmean(row)) if np.isfinite(row).any() else None
                 for train_seed, row in zip(own.train_seeds, own.time, strict=True)
             },
-            published=study.published.get(name),
+            published=published,
+            success_difference=difference(paired_success, "success"),
+            time_difference=difference(paired_times, "time"),
+            published_success=published_success(success, own.episodes, published, study.trials),
+            published_time=published_time(own.time, published, study.time_rounding),
         )
-        if name != reference:
-            pair = [own, outcomes[reference]]
-            success, success_there = on_common_seeds(pair, "success")
-            time, time_there = on_common_seeds(pair, "time")
-            found = replace(
-                found,
-                success_difference=paired_success(
-                    success, success_there, rng(name, "success difference"), resamples
-                ),
-                time_difference=paired_times(
-                    time, time_there, rng(name, "time difference"), resamples
-                ),
-            )
-        if theirs := found.published:
-            found = replace(
-                found,
-                published_success=compare_published_success(
-                    found.success.count, own.episodes, theirs, study.trials
-                ),
-                published_time=compare_published_time(own.time, theirs, study.time_rounding),
-            )
-        return found
 
     found = [statistics_of(condition) for condition in described]
     for kind in _COMPARISONS:
-        corrected = correct_comparisons([getattr(c, kind) for c in found])
+        corrected = holm([getattr(c, kind) for c in found])
         found = [replace(c, **{kind: new}) for c, new in zip(found, corrected, strict=True)]
-    common = set.intersection(*(_complete_seeds(own) for own in outcomes.values()))
+    claims = [claim for claim in study.claims if set(claim.weights) <= set(outcomes)]
+    findings = tuple(_finding(claim, study, outcomes, seed, resamples) for claim in claims)
+    seeds = set.intersection(*(own.complete_seeds for own in outcomes.values()))
     return BenchmarkStatistics(
-        task,
-        study,
-        tuple(found),
-        reference,
-        tuple(sorted(common)),
-        tuple(
-            _finding(claim, study, outcomes, seed, resamples)
-            for claim in study.claims
-            if set(claim.weights) <= set(outcomes)
-        ),
+        task, study, tuple(found), reference, tuple(sorted(seeds)), findings
     )
+
+
+def _generator(seed: int, text: str) -> np.random.Generator:
+    return np.random.default_rng([seed, zlib.crc32(text.encode())])
 
 
 def _described_by(name: str, rows: Sequence[ResultRow]) -> ConditionDescription:
     spec = rows[0].result.observation
     return describe_condition(name, ObservationSpec.from_json(spec) if spec else None)
-
-
-def _complete_seeds(outcomes: OutcomeMatrix) -> set[int]:
-    """Return the evaluation seeds that every training seed has."""
-    is_there = np.isfinite(outcomes.success)
-    return {seed for column, seed in enumerate(outcomes.seeds) if is_there[:, column].all()}
 
 
 def _finding(
@@ -280,7 +262,7 @@ def _finding(
 
     Times are compared over episodes in which all of them succeeded.
     """
-    rng = np.random.default_rng([seed, zlib.crc32(claim.text.encode())])
+    rng = _generator(seed, claim.text)
     matrices = on_common_seeds([outcomes[name] for name in claim.weights], claim.measure)
     contrast = np.tensordot(list(claim.weights.values()), matrices, axes=1)
     estimate = mean_estimate(contrast, rng, resamples)

@@ -115,6 +115,12 @@ class OutcomeMatrix:
         """Number of episodes."""
         return int(np.isfinite(self.success).sum())
 
+    @property
+    def complete_seeds(self) -> set[int]:
+        """Evaluation seeds that every training seed has."""
+        is_complete = np.isfinite(self.success).all(axis=0)
+        return {seed for seed, complete in zip(self.seeds, is_complete, strict=True) if complete}
+
     def success_within(self, limit: float) -> Floats:
         """Return (R, E) 1 or 0: success with a completion time of at most ``limit`` s."""
         is_within = np.nan_to_num(self.time, nan=np.inf) <= limit

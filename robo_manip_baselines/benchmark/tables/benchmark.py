@@ -13,7 +13,7 @@ from robo_manip_baselines.benchmark.statistics.analysis import (
     ConditionStatistics,
     Finding,
 )
-from robo_manip_baselines.benchmark.statistics.comparison import SIGNIFICANCE
+from robo_manip_baselines.benchmark.statistics.inference import SIGNIFICANCE
 from robo_manip_baselines.benchmark.statistics.outcomes import RowSelection
 from robo_manip_baselines.benchmark.tables.table import NOTHING, Cell, Column, Row, Table
 
