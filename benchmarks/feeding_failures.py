@@ -1,6 +1,6 @@
 """Failures of a benchmark's conditions in the same episodes, and how much recorded mouths move.
 
-    python benchmarks/feeding_failures.py docs/results/feeding-cpu/results.jsonl
+python benchmarks/feeding_failures.py docs/results/feeding-cpu/results.jsonl
 """
 
 from __future__ import annotations
