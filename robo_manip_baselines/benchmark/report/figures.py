@@ -177,7 +177,8 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
             axes.plot(x, rate, "o-", **style)
         else:  # a band of one horizon has no width
             place = x + shift / 2 if label else x
-            axes.errorbar(place, rate, [rate - low, high - rate], fmt="o", capsize=4, **style)
+            errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
+            axes.errorbar(place, rate, errors, fmt="o", capsize=4, **style)
         there = [(h, c.published.successes) for h, c in zip(x, own, strict=True) if c.published]
         if there:
             places, successes = np.array(there, dtype=np.float64).T
