@@ -66,7 +66,7 @@ def test_rows_of_many_files(tmp_path: Path, make_rows: MakeRows) -> None:
     assert [row.result for row in found] == [row.result for row in rows]
     elsewhere = read_result_rows(files[:1], root=tmp_path / "report")[0].file
     assert elsewhere == "../runs/seed0/results.jsonl"
-    with pytest.raises(RequestError, match=r"training seed 0, seed 1000 is also in .*row 1"):
+    with pytest.raises(RequestError, match=r"training seed 0, seed 1000 is also in .*line 1"):
         read_result_rows([files[0], files[0]])
     files[0].write_text('{"seed": 1}\n')
     with pytest.raises(RequestError, match=r"row 1 is damaged: 'env' is missing"):
@@ -162,7 +162,8 @@ def test_intervals_do_not_depend_on_other_conditions(
         one, other = alone.of(name), statistics.of(name)
         assert one.time == other.time
         assert one.success == other.success
-        assert one.success_difference == other.success_difference
+        assert one.success_difference.difference == other.success_difference.difference
+        assert one.success_difference.p == other.success_difference.p
 
 
 def test_reference(make_rows: MakeRows) -> None:
@@ -255,11 +256,11 @@ def test_common_seeds_of_three_conditions(rows: tuple[ResultRow, ...]) -> None:
 
 
 def test_claims_hold_in_the_papers_own_numbers(statistics: BenchmarkStatistics) -> None:
-    published = {finding.claim: finding.published for finding in statistics.findings}
-    papers = [published[claim] for claim in PAPER_CLAIMS]
+    published = {finding.claim.text: finding.published for finding in statistics.findings}
+    papers = [published[claim.text] for claim in PAPER_CLAIMS]
     assert np.round(papers, 4).tolist() == [0.18, 0.14, 0.0833, -0.052, 0.3]  # type: ignore[arg-type]
     for claim in PAPER_CLAIMS:
-        contrast = published[claim]
+        contrast = published[claim.text]
         assert contrast is not None
         assert contrast > claim.limit
     assert all(sum(claim.weights.values()) == pytest.approx(0.0) for claim in STUDY.claims)
