@@ -56,9 +56,7 @@ def aggregate_results(
     ]
     write_text(out / RESULTS, "".join(f"{row}\n" for row in rows))
     # A condition of another expert or prediction is not what its observation alone describes.
-    conditions = {
-        c.name: describe_condition(c.name, c.spec, c.title) for c in plan.conditions
-    }
+    conditions = {c.name: describe_condition(c.name, c.spec, c.title) for c in plan.conditions}
     return analyze(
         read_result_rows([out / RESULTS], out),
         task=task_entry(plan.env),
@@ -68,7 +66,7 @@ def aggregate_results(
 
 
 def videos_to_make(plan: Plan, statistics: BenchmarkStatistics) -> dict[WorkItem, ResultRow]:
-    """Return the work items that draw a success and a failure of each condition, with their rows."""
+    """Return work items that draw a success and a failure of each condition, with their rows."""
     return {plan.video(row.result): row for row in episodes_to_show(statistics)}
 
 

@@ -214,12 +214,18 @@ def read_conditions(path: Path) -> ConditionFile:
                 )
             conditions.append(condition)
         place = ""
-        presets = {
-            preset: tuple(task.load_study().published) if names == PUBLISHED else tuple(names)
-            for preset, names in (content.get("presets") or {}).items()
-        }
-        file = ConditionFile(task.name, tuple(conditions), presets)
-        for names in presets.values():
+        presets = content.get("presets", {})
+        if not isinstance(presets, dict) or not all(
+            names == PUBLISHED or isinstance(names, list) for names in presets.values()
+        ):
+            raise RequestError(f"presets map names of presets to '{PUBLISHED}', or a list of names")
+        published = task.load_study().published
+        file = ConditionFile(
+            task.name,
+            tuple(conditions),
+            {k: tuple(published if v == PUBLISHED else v) for k, v in presets.items()},
+        )
+        for names in file.presets.values():
             file.choose(names)
     except RequestError as error:
         raise RequestError(f"'{path}'{place}: {error}") from None

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robo_manip_baselines.benchmark.conditions import ConditionConfig
-from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, InputFile, WorkItem
+from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, WorkItem
 from robo_manip_baselines.benchmark.worker import FORECAST, LIBRARY, STATS
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
@@ -46,8 +46,8 @@ class BenchmarkPreset:
         gpu_share: of a GPU for each training and evaluation.
         caution: for readers of the report; empty where none is needed.
         has_videos: whether the report shows a success and a failure of each condition.
-        seconds: expected s per ``demonstration``, ``training``, ``episode`` of an evaluation and
-            ``video``, as measured, for the time left before any item has been done.
+        seconds: kind of work item -> expected s for each of its episodes, or for the training, as
+            measured; for the time left before any item has been done.
 
     Raises:
         RequestError: a value is not valid.
@@ -84,7 +84,7 @@ PRESETS: dict[str, BenchmarkPreset] = {
         demonstration_block=25,
         num_episodes=100,
         episode_block=50,
-        seconds={"demonstration": 2.0, "training": 460.0, "episode": 1.2, "video": 40.0},
+        seconds={"demonstrations": 2.0, "training": 460.0, "evaluation": 1.2, "video": 40.0},
     ),
     # The paper's setting (Table III, section IV.C): three cameras, 50 demonstrations, 50 episodes.
     "paper": BenchmarkPreset(
@@ -97,7 +97,7 @@ PRESETS: dict[str, BenchmarkPreset] = {
         device="cuda",
         threads=2,
         gpu_share=0.125,
-        seconds={"demonstration": 10.0, "training": 600.0, "episode": 8.0, "video": 40.0},
+        seconds={"demonstrations": 10.0, "training": 600.0, "evaluation": 8.0, "video": 40.0},
     ),
     # A check of the whole chain in three minutes, too small for any conclusion.
     "smoke": BenchmarkPreset(
@@ -110,7 +110,7 @@ PRESETS: dict[str, BenchmarkPreset] = {
         train_settings={"steps": 200, "hidden_size": 64, "feedforward_size": 128},
         caution="This size only shows that everything works: its policies have hardly learnt "
         "anything. --preset cpu compares conditions.",
-        seconds={"demonstration": 3.0, "training": 20.0, "episode": 3.0, "video": 20.0},
+        seconds={"demonstrations": 3.0, "training": 20.0, "evaluation": 3.0, "video": 20.0},
     ),
 }
 
@@ -146,8 +146,8 @@ class Plan:
     env: str
     preset: BenchmarkPreset
     conditions: tuple[ConditionConfig, ...]
-    library: InputFile | None = None
-    error_stats: InputFile | None = None
+    library: Path | None = None
+    error_stats: Path | None = None
 
     @cached_property
     def runs(self) -> tuple[PlannedRun, ...]:
@@ -179,96 +179,66 @@ class Plan:
 
     def video(self, result: EpisodeResult) -> WorkItem:
         """Return the work item that runs the episode of a result once more, for a video."""
-        run = next(
-            run
-            for run in self.runs
-            if (run.condition.name, run.train_seed) == (result.condition, result.train_seed or 0)
-        )
+        key = result.condition, result.train_seed or 0
+        run = next(run for run in self.runs if (run.condition.name, run.train_seed) == key)
+        name = f"{run.training.name}_{result.seed}"
         seeds = range(result.seed, result.seed + 1)
-        name = f"{run.condition.name}_seed{run.train_seed}_{result.seed}"
-        seconds = self.preset.seconds.get("video", 30.0)
-        return self._evaluation("video", name, seeds, run.condition, run.training, seconds)
+        return self._evaluation("video", name, seeds, run.condition, run.training)
 
     def _demonstrations(self, condition: ConditionConfig) -> tuple[WorkItem, ...]:
-        preset, prediction = self.preset, condition.prediction
+        prediction, variant = condition.prediction, condition.expert
         env_kwargs: dict[str, Any] = {
-            "cameras": preset.cameras,
+            "cameras": self.preset.cameras,
             "image_size": ObservationSpec().image_size,
             "face_motion": "episode",
         }
-        if prediction != "truth" or self.library:
-            env_kwargs["motion_library"] = LIBRARY if prediction == "truth" else FORECAST
-        variant = condition.expert + (f"_{prediction}" if prediction != "truth" else "")
-        return tuple(
-            WorkItem(
-                "demonstrations",
-                f"{variant}_{seeds.start:06d}",
-                f"{_FUNCTIONS}:demonstrate",
-                {
-                    "config": Collection(
-                        self.env, Path(OUT), condition.expert, seeds, env_kwargs
-                    ).to_json(),
-                    "prediction": prediction,
-                },
-                files=(self.library,) if self.library else (),
-                seconds=len(seeds) * preset.seconds.get("demonstration", 5.0),
-            )
-            for seeds in _blocks(0, preset.demonstrations, preset.demonstration_block)
-        )
+        if prediction != "truth":
+            variant += f"_{prediction}"
+            env_kwargs["motion_library"] = FORECAST
+        elif self.library:
+            env_kwargs["motion_library"] = LIBRARY
+        items = []
+        for seeds in _blocks(0, self.preset.demonstrations, self.preset.demonstration_block):
+            config = Collection(self.env, Path(OUT), condition.expert, seeds, env_kwargs)
+            name = f"{variant}_{seeds.start:06d}"
+            settings = {"config": config.to_json(), "prediction": prediction}
+            item = self._item("demonstrations", name, "demonstrate", settings, self._files())
+            items.append(replace(item, threads=1, gpus=0.0, seconds=item.seconds * len(seeds)))
+        return tuple(items)
 
     def _run(
         self, condition: ConditionConfig, train_seed: int, demonstrations: tuple[WorkItem, ...]
     ) -> PlannedRun:
         preset = self.preset
-        config = TrainConfig.from_json(
-            {
-                "policy": condition.policy,
-                "preset": preset.train_preset,
-                "env": self.env,
-                **preset.train_settings,
-                "seed": train_seed,
-                "device": preset.device,
-                "logger": "none",
-                "dataset": MOUNTS["demonstrations"],
-                "out": OUT,
-            }
-        )
+        settings = {
+            "policy": condition.policy,
+            "preset": preset.train_preset,
+            "env": self.env,
+            **preset.train_settings,
+            "seed": train_seed,
+            "device": preset.device,
+            "logger": "none",
+            "dataset": MOUNTS["demonstrations"],
+            "out": OUT,
+        }
+        config = TrainConfig.from_json(settings)
         spec = condition.observation(config.spec)
-        stats = self.error_stats if spec.corruption.error in MEASURED_ERRORS else None
-        if stats:
+        files = self._files()
+        if self.error_stats and spec.corruption.error in MEASURED_ERRORS:
             spec = replace(spec, corruption=replace(spec.corruption, error_stats=STATS))
-        training = WorkItem(
-            "training",
-            f"{condition.name}_seed{train_seed}",
-            f"{_FUNCTIONS}:train",
-            {"config": replace(config, spec=spec).to_json()},
-            needs=demonstrations,
-            files=tuple(file for file in (self.library, stats) if file),
-            threads=preset.threads,
-            gpus=preset.gpu_share,
-            seconds=preset.seconds.get("training", 600.0),
-        )
+            files[STATS] = self.error_stats
+        config = replace(config, spec=spec)
+        name = f"{condition.name}_seed{train_seed}"
+        training = self._item("training", name, "train", {"config": config.to_json()}, files)
+        training = replace(training, needs=demonstrations)
         evaluations = tuple(
-            self._evaluation(
-                "evaluation",
-                f"{training.name}_{seeds.start:06d}",
-                seeds,
-                condition,
-                training,
-                len(seeds) * preset.seconds.get("episode", 5.0),
-            )
+            self._evaluation("evaluation", f"{name}_{seeds.start:06d}", seeds, condition, training)
             for seeds in _blocks(FIRST_SEED, preset.num_episodes, preset.episode_block)
         )
         return PlannedRun(condition, train_seed, training, evaluations)
 
     def _evaluation(
-        self,
-        kind: str,
-        name: str,
-        seeds: range,
-        condition: ConditionConfig,
-        training: WorkItem,
-        seconds: float,
+        self, kind: str, name: str, seeds: range, condition: ConditionConfig, training: WorkItem
     ) -> WorkItem:
         config = EvaluationConfig(
             checkpoint=Path(MOUNTS["training"]),
@@ -279,17 +249,31 @@ class Plan:
             device=self.preset.device,
             videos=int(kind == "video"),
         )
+        settings = {"config": config.to_json(), "prediction": condition.prediction}
+        item = self._item(kind, name, "evaluate", settings, training.files)
+        return replace(item, needs=(training,), seconds=item.seconds * len(seeds))
+
+    def _item(
+        self,
+        kind: str,
+        name: str,
+        function: str,
+        settings: Mapping[str, Any],
+        files: Mapping[str, Path],
+    ) -> WorkItem:
         return WorkItem(
             kind,
             name,
-            f"{_FUNCTIONS}:evaluate",
-            {"config": config.to_json(), "prediction": condition.prediction},
-            needs=(training,),
-            files=training.files,
+            f"{_FUNCTIONS}:{function}",
+            settings,
+            files=files,
             threads=self.preset.threads,
             gpus=self.preset.gpu_share,
-            seconds=seconds,
+            seconds=self.preset.seconds.get(kind, 60.0),
         )
+
+    def _files(self) -> dict[str, Path]:
+        return {LIBRARY: self.library} if self.library else {}
 
 
 def make_plan(
@@ -322,8 +306,8 @@ def make_plan(
         env,
         preset,
         tuple(condition.for_task(task_entry(env)) for condition in conditions),
-        library and InputFile.of(LIBRARY, library),
-        error_stats and InputFile.of(STATS, error_stats),
+        library and library.resolve(),
+        error_stats and error_stats.resolve(),
     )
 
 

@@ -90,7 +90,7 @@ class RayExecutor:
     def start(self, item: WorkItem) -> None:
         """Hand an item to Ray, with its inputs."""
         inputs = [
-            self._ray.put({file.name: file.path.read_bytes() for file in item.files}),
+            self._ray.put({name: path.read_bytes() for name, path in item.files.items()}),
             *map(self._put_outputs, item.needs),
         ]
         task = self._task.options(

@@ -52,23 +52,18 @@ class Executor(Protocol):
 
     def has_room(self, item: WorkItem) -> bool:
         """Whether an item can be started now."""
-        ...
 
     def workers(self, threads: int, gpus: float) -> int:
         """Return how many items that need so much run at once."""
-        ...
 
     def start(self, item: WorkItem) -> None:
         """Start an item whose needs are done."""
-        ...
 
     def wait(self) -> Iterable[WorkResult]:
         """Wait for results, for half a second at most."""
-        ...
 
     def close(self) -> None:
         """End all running items, which can be continued later."""
-        ...
 
 
 class LocalExecutor:
@@ -274,7 +269,7 @@ class GridProgress:
         self._bar.close()
 
     def _remaining(self) -> list[float]:
-        """Return the s of each item that has not ended; 0 for one that takes longer than its cost."""
+        """Return the s of each item that has not ended; 0 for one that has exceeded its cost."""
         now = self._clock()
         return [
             max(self.cost(item) - (now - self._started.get(key, now)), 0.0)

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -45,28 +45,9 @@ def item_versions() -> dict[str, str]:
     return software_versions("h5py", "mujoco", "numpy", "robo_manip_baselines", "torch")
 
 
-@dataclass(frozen=True)
-class InputFile:
-    """File of the user that work items read.
-
-    Attributes:
-        name: in the folder of an item.
-        path: of the file.
-        sha256: of its bytes.
-    """
-
-    name: str
-    path: Path
-    sha256: str
-
-    @classmethod
-    def of(cls, name: str, path: Path) -> InputFile:
-        """Record the present contents of a file.
-
-        Raises:
-            OSError: it cannot be read.
-        """
-        return cls(name, path.resolve(), file_digest(path))
+@cache
+def _digest(path: Path) -> str:
+    return file_digest(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +61,7 @@ class WorkItem:
             folder.
         settings: everything that decides the outputs, ready for JSON.
         needs: items whose outputs it reads.
-        files: files of the user that it reads.
+        files: name in the item's folder -> file of the user that it reads.
         threads: CPU threads.
         gpus: share of a GPU, 0 for none.
         seconds: expected duration.
@@ -91,7 +72,7 @@ class WorkItem:
     function: str
     settings: Mapping[str, Any]
     needs: tuple[WorkItem, ...] = ()
-    files: tuple[InputFile, ...] = ()
+    files: Mapping[str, Path] = field(default_factory=dict)
     threads: int = 1
     gpus: float = 0.0
     seconds: float = 1.0
@@ -100,19 +81,23 @@ class WorkItem:
         return f"{self.kind} {self.name}"
 
     @cached_property
-    def key(self) -> str:
-        """SHA-256 of everything that the outputs depend on, versions of the software included."""
-        content = {
+    def content(self) -> dict[str, Any]:
+        """Everything that the outputs depend on, ready for JSON."""
+        return {
             "kind": self.kind,
             "name": self.name,  # conditions that are equal but for it are trained separately
             "function": self.function,
-            "settings": self.settings,
+            "settings": dict(self.settings),
             "needs": sorted(need.key for need in self.needs),
-            "files": {file.name: file.sha256 for file in self.files},
+            "inputs": {name: _digest(path) for name, path in self.files.items()},
             "threads": self.threads,
             "versions": item_versions(),
         }
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @cached_property
+    def key(self) -> str:
+        """SHA-256 of the content."""
+        return hashlib.sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()
 
     @property
     def folder(self) -> str:
@@ -125,16 +110,7 @@ class WorkItem:
         The digest of the package's files is no part of the key: a corrected comment would cost
         hours of training.
         """
-        return {
-            "key": self.key,
-            "kind": self.kind,
-            "name": self.name,
-            "function": self.function,
-            "settings": dict(self.settings),
-            "threads": self.threads,
-            "versions": item_versions(),
-            "source": source_digest(),
-        }
+        return {"key": self.key, **self.content, "source": source_digest()}
 
 
 class ArtifactStore:
@@ -170,7 +146,7 @@ class ArtifactStore:
         """Make and return the folder of an item, with links to its inputs; its needs are done."""
         folder = self.folder(item)
         folder.mkdir(parents=True, exist_ok=True)
-        inputs = {file.name: file.path for file in item.files}
+        inputs = dict(item.files)
         for need in item.needs:
             outputs = self.outputs(need).items()
             inputs |= {f"{MOUNTS[need.kind]}/{name}": path for name, path in outputs}

@@ -66,7 +66,12 @@ def start_worker(
     environment = dict.fromkeys(threads, str(request["threads"])) | {"TQDM_DISABLE": "1"}
     with (folder / LOG).open("ab") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "robo_manip_baselines.benchmark.worker", *([SCRATCH] if is_scratch else [])],
+            [
+                sys.executable,
+                "-m",
+                "robo_manip_baselines.benchmark.worker",
+                *([SCRATCH] if is_scratch else []),
+            ],
             cwd=folder,
             env={**os.environ, **environment},
             stdin=subprocess.PIPE,

@@ -53,9 +53,6 @@ EXAMPLE = "python bin/Benchmark.py feeding --preset smoke"
 
 EXECUTORS = ("local", "ray")
 
-RENAMED = {"--arms": "--conditions", "--arms_file": "--conditions_file"}
-"""Options under their names of earlier releases."""
-
 EARLIER_ITEMS = "units"
 """Folder of the work items of earlier releases."""
 
@@ -168,14 +165,10 @@ def parse_options(args: Sequence[str]) -> BenchmarkOptions:
         RequestError: one line that names what is wrong and what is valid.
         SystemExit: with code 0 after ``--help``.
     """
-    renamed = []
-    for arg in args:
-        option, sign, value = arg.partition("=")
-        if new := RENAMED.get(option.replace("-", "_").replace("__", "--", 1)):
-            logger.info("%s is called %s now; both are read", option, new)
-            option = new
-        renamed.append(f"{option}{sign}{value}")
-    return parse(BenchmarkOptions, EXAMPLE, description=DESCRIPTION, args=renamed)
+    given = [re.sub(r"^--arms(?=$|=|[-_]file)", "--conditions", arg) for arg in args]
+    if given != list(args):
+        logger.info("--arms and --arms_file are called --conditions and --conditions_file now")
+    return parse(BenchmarkOptions, EXAMPLE, description=DESCRIPTION, args=given)
 
 
 def benchmark(options: BenchmarkOptions) -> int:
@@ -270,7 +263,7 @@ def carry_out(
         logger.warning("no videos: %s", problem)
         has_videos = False
     workers = executor.workers(plan.preset.threads, plan.preset.gpu_share)
-    later = 2 * len(plan.conditions) * plan.video_seconds if has_videos else 0.0
+    later = 2 * len(plan.conditions) * plan.preset.seconds.get("video", 30.0) if has_videos else 0.0
     with closing(GridProgress(items, workers, later=later)) as progress:
         _count_done(progress, items, store)
         run_items(items, store, executor, progress)
@@ -303,9 +296,7 @@ def overview(plan: Plan, items: Sequence[WorkItem], store: ArtifactStore, worker
     return closing_table(rows)
 
 
-def _count_done(
-    progress: GridProgress, items: Iterable[WorkItem], store: ArtifactStore
-) -> float:
+def _count_done(progress: GridProgress, items: Iterable[WorkItem], store: ArtifactStore) -> float:
     """Count the items that are done as ended; return the s that they took."""
     total = 0.0
     for item in items:
