@@ -30,7 +30,7 @@ from robo_manip_baselines.rollout.videos import (
 from robo_manip_baselines.rollout.workers import open_environments
 
 if TYPE_CHECKING:
-    from robo_manip_baselines.policy.execution import ChunkPolicy
+    from robo_manip_baselines.policy.execution import PolicyRunner
 
 
 logger = logging.getLogger(__name__)
@@ -106,17 +106,17 @@ def run(evaluation: Evaluation, seeds: Sequence[int], on_episode: OnEpisode) -> 
         rollout(policy, environments, seeds, on_episode=finished)
 
 
-def make_policy(evaluation: Evaluation, slots: int) -> ChunkPolicy:
+def make_policy(evaluation: Evaluation, slots: int) -> PolicyRunner:
     """Load the network and make it act in so many slots."""
-    from robo_manip_baselines.policy.execution import ChunkPolicy
+    from robo_manip_baselines.policy.execution import PolicyRunner
 
     checkpoint, device = evaluation.checkpoint, evaluation.device
-    return ChunkPolicy(
+    return PolicyRunner(
         load_model(checkpoint, device),
         checkpoint.spec,
         checkpoint.normalization,
-        evaluation.acting,
-        slots=slots,
+        evaluation.execution,
+        num_envs=slots,
         device=device,
         precision=evaluation.precision,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from contextlib import closing
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import env_id
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.spec import CorruptionOptions, parse_cameras, parse_image_size
 from robo_manip_baselines.policy.checkpoint import Checkpoint, read_checkpoint
-from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.policy.registry import policy_entry
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.workers import Task
@@ -98,17 +98,17 @@ class Evaluation:
     Attributes:
         checkpoint: of the policy.
         task: where it acts.
-        acting: how its chunks become actions.
+        execution: execution of its action chunks.
         seeds: of the episodes.
         out: folder of the results.
         num_envs, workers: see ``open_environments``.
         device: where the network runs.
-        precision: of the network, see ``ChunkPolicy``.
+        precision: of the network, see ``PolicyRunner``.
     """
 
     checkpoint: Checkpoint
     task: Task
-    acting: Acting
+    execution: ActionExecution
     seeds: range
     out: Path
     num_envs: int
@@ -117,11 +117,11 @@ class Evaluation:
     precision: str
 
     def __str__(self) -> str:
-        acting, checkpoint = self.acting, self.checkpoint
+        execution, checkpoint = self.execution, self.checkpoint
         how = (
-            f"temporal ensemble (decay {acting.decay:g})"
-            if acting.temporal_ensemble
-            else f"{acting.execute} actions of each chunk"
+            f"temporal ensemble (decay {execution.ensemble_decay:g})"
+            if execution.temporal_ensemble
+            else f"{execution.n_action_steps} actions of each chunk"
         )
         return (
             f"{checkpoint.policy}, {self.arm}, step {checkpoint.step}, on "
@@ -148,7 +148,7 @@ class Evaluation:
             "xml_hash": self.checkpoint.xml_hash,
             "policy": self.checkpoint.policy,
             "checkpoint": self.checkpoint.content_hash,
-            "acting": _effective(self.acting),
+            "acting": _effective(self.execution),
             "device": self.device.type,
             "precision": self.precision,
         }
@@ -186,10 +186,10 @@ def plan(options: RolloutOptions) -> Evaluation:
             "which checkpoint? say --checkpoint runs/..., as bin/Train.py printed it"
         )
     # Imported here: what was wrong above is said without waiting for PyTorch.
-    from robo_manip_baselines.policy.execution import PRECISIONS
+    from robo_manip_baselines.policy.execution import INFERENCE_PRECISIONS
     from robo_manip_baselines.training.device import choose_device
 
-    require_choice("precision", given.precision, PRECISIONS)
+    require_choice("precision", given.precision, INFERENCE_PRECISIONS)
     checkpoint = read_checkpoint(given.checkpoint)
     _refuse_contradictions(options, checkpoint)
     recorded = checkpoint.dataset.get("env_kwargs", {})
@@ -203,7 +203,7 @@ def plan(options: RolloutOptions) -> Evaluation:
     return Evaluation(
         checkpoint=checkpoint,
         task=task,
-        acting=choose_acting(checkpoint.acting, given),
+        execution=choose_execution(checkpoint.execution, given),
         seeds=options.seeds(FIRST_SEED),
         out=options.out
         or Path("results")
@@ -215,8 +215,8 @@ def plan(options: RolloutOptions) -> Evaluation:
     )
 
 
-def choose_acting(trained: Acting, given: PolicyOptions) -> Acting:
-    """Return how to act: as the checkpoint says, or as was typed.
+def choose_execution(trained: ActionExecution, given: PolicyOptions) -> ActionExecution:
+    """Return the checkpoint's action execution with the options that were given.
 
     Raises:
         RequestError: both ways were typed.
@@ -224,7 +224,7 @@ def choose_acting(trained: Acting, given: PolicyOptions) -> Acting:
     if given.temporal_ensemble and given.execute is not None:
         raise RequestError("--temporal_ensemble and --execute: say one of them")
     if given.execute is not None:
-        return replace(trained, temporal_ensemble=False, execute=given.execute)
+        return replace(trained, temporal_ensemble=False, n_action_steps=given.execute)
     return replace(trained, temporal_ensemble=True) if given.temporal_ensemble else trained
 
 
@@ -239,7 +239,7 @@ def check_fit(checkpoint: Checkpoint, task: Task) -> None:
         pairs = {
             "actions": (", ".join(checkpoint.action_names), ", ".join(world.action_names)),
             "control period": (checkpoint.control_period, CONTROL_PERIOD),
-            "size of the state": (checkpoint.sizes.state, task.vector_size),
+            "size of the state": (checkpoint.dims.state, task.vector_size),
             "model hash": (checkpoint.xml_hash[:12], world.xml_hash[:12]),
         }
     for name, (trained, here) in pairs.items():
@@ -306,10 +306,10 @@ def software() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
-def _effective(acting: Acting) -> dict[str, Any]:
-    """Return what of the settings makes a difference."""
-    used = "decay" if acting.temporal_ensemble else "execute"
-    return {name: asdict(acting)[name] for name in ("temporal_ensemble", used)}
+def _effective(execution: ActionExecution) -> dict[str, Any]:
+    """Return the settings that make a difference."""
+    used = "decay" if execution.temporal_ensemble else "execute"
+    return {name: execution.to_json()[name] for name in ("temporal_ensemble", used)}
 
 
 def _spelt(value: object) -> str:

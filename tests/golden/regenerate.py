@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
-from robo_manip_baselines.policy.interface import Batch, Sizes
+from robo_manip_baselines.policy.interface import Batch, PolicyDims
 from robo_manip_baselines.runs.files import atomic_file
 
 ACT_STEP = Path(__file__).with_name("act_step.json")
 
-SIZES = Sizes(state=14, action=7, cameras=2, image=(48, 72))
+DIMS = PolicyDims(state=14, action=7, cameras=2, image=(48, 72))
 CONFIG = {
     "chunk_size": 8,
     "hidden_size": 32,
@@ -74,8 +74,8 @@ def fixed_batch() -> Batch:
     """Three examples of 8, 5 and 1 valid steps."""
     is_pad = torch.arange(8)[None] >= torch.tensor([[8], [5], [1]])
     return Batch(
-        state=fill((3, 14), 1, 1.5),
-        images=(127.5 + fill((3, 2, 48, 72, 3), 2, 127.5)).to(torch.uint8),
+        state=fill((3, 1, 14), 1, 1.5),
+        images=(127.5 + fill((3, 1, 2, 48, 72, 3), 2, 127.5)).to(torch.uint8),
         action=fill((3, 8, 7), 3, 1.5),
         is_pad=is_pad,
         noise=fill((3, 6), 4, 1.5),
@@ -86,7 +86,7 @@ def fixed_batch() -> Batch:
 
 def act_step(paper_compat: bool) -> dict[str, Any]:
     """Losses before and after one step of AdamW; norms of gradients and of weights after it."""
-    model = ActModel(ActConfig(**CONFIG, paper_compat=paper_compat), SIZES)
+    model = ActModel(ActConfig(**CONFIG, paper_compat=paper_compat), DIMS)
     fill_parameters(model)
     batch = fixed_batch()
     optimizer = torch.optim.AdamW(model.parameter_groups(1e-3), weight_decay=1e-4)

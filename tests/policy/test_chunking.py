@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from robo_manip_baselines.policy.execution import (
-    Chunking,
-    ExecuteFirst,
+    ActionBuffer,
+    ActionQueue,
     TemporalEnsemble,
-    make_chunking,
+    make_action_buffer,
 )
-from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.runs.errors import RequestError
 
 ACTION_SIZE = 2
@@ -39,35 +39,35 @@ def first_oracle(chunks: NDArray[np.float32], execute: int) -> NDArray[np.float3
 
 @dataclasses.dataclass
 class Play:
-    """Episodes played one after another in slots, each slot at a pace of its own."""
+    """Episodes played one after another in environments, each at a pace of its own."""
 
-    chunking: Chunking
+    buffer: ActionBuffer
     actions: dict[int, list[NDArray[np.float32]]] = dataclasses.field(default_factory=dict)
 
-    def step(self, slots: list[int], chunks: NDArray[np.float32]) -> None:
-        numbers = np.array(slots)
-        needed = self.chunking.needs_chunk(numbers)
-        for slot, action in zip(slots, self.chunking.act(numbers, chunks[needed]), strict=True):
-            self.actions.setdefault(slot, []).append(action)
+    def step(self, env_ids: list[int], chunks: NDArray[np.float32]) -> None:
+        numbers = np.array(env_ids)
+        needed = self.buffer.steps_to_prediction(numbers) == 0
+        for env, action in zip(env_ids, self.buffer.act(numbers, chunks[needed]), strict=True):
+            self.actions.setdefault(env, []).append(action)
 
 
 @st.composite
-def schedules(draw: st.DrawFn) -> tuple[int, list[list[int]]]:
-    """Number of slots, and for every turn the slots that act, in any order."""
-    slots = draw(st.integers(1, 4))
-    some = st.lists(st.integers(0, slots - 1), unique=True, min_size=1)
-    return slots, draw(st.lists(some, min_size=1, max_size=25))
+def turns_of_envs(draw: st.DrawFn) -> tuple[int, list[list[int]]]:
+    """Number of environments, and for every turn those that act, in any order."""
+    num_envs = draw(st.integers(1, 4))
+    some = st.lists(st.integers(0, num_envs - 1), unique=True, min_size=1)
+    return num_envs, draw(st.lists(some, min_size=1, max_size=25))
 
 
 @given(
-    schedule=schedules(),
+    schedule=turns_of_envs(),
     size=st.integers(1, 7),
     execute=st.integers(0, 7),
     decay=st.sampled_from([0.01, 0.0, 0.7, -0.3]),
     reset_at=st.integers(0, 25),
     seed=st.integers(0, 99),
 )
-def test_every_slot_acts_as_if_it_were_alone(
+def test_every_environment_acts_as_if_it_were_alone(
     schedule: tuple[int, list[list[int]]],
     size: int,
     execute: int,
@@ -75,58 +75,58 @@ def test_every_slot_acts_as_if_it_were_alone(
     reset_at: int,
     seed: int,
 ) -> None:
-    """Execute 0 stands for the ensemble. Slot 0 starts another episode at turn ``reset_at``."""
-    slots, turns = schedule
+    """Execute 0 stands for the ensemble. Environment 0 starts another episode at turn ``reset_at``."""
+    num_envs, turns = schedule
     execute = min(execute, size)
-    acting = Acting(temporal_ensemble=execute == 0, decay=decay, execute=max(execute, 1))
-    play = Play(make_chunking(acting, slots, size, ACTION_SIZE))
+    execution = ActionExecution(temporal_ensemble=execute == 0, ensemble_decay=decay, n_action_steps=max(execute, 1))
+    play = Play(make_action_buffer(execution, num_envs, size, ACTION_SIZE))
     rng = np.random.default_rng(seed)
     # Zeros among them: a prediction of zero is a prediction.
-    draw = rng.integers(-2, 3, (len(turns), slots, size, ACTION_SIZE)).astype(np.float32)
-    episodes: list[tuple[int, list[NDArray[np.float32]]]] = [(s, []) for s in range(slots)]
-    current = dict(enumerate(range(slots)))
-    expected_of: dict[int, list[int]] = {s: [s] for s in range(slots)}
+    draw = rng.integers(-2, 3, (len(turns), num_envs, size, ACTION_SIZE)).astype(np.float32)
+    episodes: list[tuple[int, list[NDArray[np.float32]]]] = [(s, []) for s in range(num_envs)]
+    current = dict(enumerate(range(num_envs)))
+    expected_of: dict[int, list[int]] = {s: [s] for s in range(num_envs)}
     for turn, acts in enumerate(turns):
         if turn == reset_at:
-            play.chunking.reset(np.array([0]))
+            play.buffer.reset(np.array([0]))
             episodes.append((0, []))
             current[0] = len(episodes) - 1
             expected_of[0].append(current[0])
-        for slot in acts:
-            episodes[current[slot]][1].append(draw[turn, slot])
+        for env in acts:
+            episodes[current[env]][1].append(draw[turn, env])
         play.step(acts, draw[turn, acts])
-    for slot in range(slots):
-        parts = [np.array(episodes[e][1]) for e in expected_of[slot] if episodes[e][1]]
+    for env in range(num_envs):
+        parts = [np.array(episodes[e][1]) for e in expected_of[env] if episodes[e][1]]
         if not parts:
             continue
         expected = np.concatenate(
             [first_oracle(p, execute) if execute else ensemble_oracle(p, decay) for p in parts]
         )
         # float32 out of float64 sums of at most 7 numbers below 3.
-        np.testing.assert_allclose(play.actions[slot], expected, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(play.actions[env], expected, rtol=0, atol=1e-6)
 
 
 def test_the_ensemble_of_two() -> None:
     ensemble = TemporalEnsemble(1, 3, 1, decay=0.5)
-    slot = np.array([0])
-    ensemble.act(slot, np.array([[[1.0], [2.0], [3.0]]], np.float32))
-    action = ensemble.act(slot, np.array([[[0.0], [0.0], [0.0]]], np.float32))
+    env = np.array([0])
+    ensemble.act(env, np.array([[[1.0], [2.0], [3.0]]], np.float32))
+    action = ensemble.act(env, np.array([[[0.0], [0.0], [0.0]]], np.float32))
     np.testing.assert_allclose(action, 2.0 / (1.0 + np.exp(-0.5)), rtol=1e-6)
 
 
-def test_an_episode_knows_nothing_of_the_last_one_in_its_slot() -> None:
+def test_an_episode_knows_nothing_of_the_last_one_in_its_environment() -> None:
     rng = np.random.default_rng(0)
     chunks = rng.normal(size=(2, 5, 4, ACTION_SIZE)).astype(np.float32)
-    for acting in (Acting(decay=0.5), Acting(temporal_ensemble=False, execute=3)):
-        used, fresh = (make_chunking(acting, 2, 4, ACTION_SIZE) for _ in range(2))
-        slot = np.array([1])
+    for execution in (ActionExecution(ensemble_decay=0.5), ActionExecution(temporal_ensemble=False, n_action_steps=3)):
+        used, fresh = (make_action_buffer(execution, 2, 4, ACTION_SIZE) for _ in range(2))
+        env = np.array([1])
         for chunk in chunks[0]:
-            used.act(slot, chunk[None][used.needs_chunk(slot)])
-        used.reset(slot)
+            used.act(env, chunk[None][used.steps_to_prediction(env) == 0])
+        used.reset(env)
         for chunk in chunks[1]:
             np.testing.assert_array_equal(
-                used.act(slot, chunk[None][used.needs_chunk(slot)]),
-                fresh.act(slot, chunk[None][fresh.needs_chunk(slot)]),
+                used.act(env, chunk[None][used.steps_to_prediction(env) == 0]),
+                fresh.act(env, chunk[None][fresh.steps_to_prediction(env) == 0]),
             )
 
 
@@ -137,18 +137,18 @@ def test_the_ensemble_holds_no_table_of_chunks() -> None:
 
 
 def test_a_chunk_is_asked_for_only_when_the_last_is_used_up() -> None:
-    first = ExecuteFirst(2, 5, 1, execute=3)
+    first = ActionQueue(2, 5, 1, n_action_steps=3)
     chunks = np.arange(5, dtype=np.float32).reshape(1, 5, 1)
     needs = []
     for _ in range(7):
-        slots = np.array([1])
-        needs.append(bool(first.needs_chunk(slots)[0]))
-        first.act(slots, chunks if needs[-1] else chunks[:0])
-    assert needs == [True, False, False, True, False, False, True]
-    assert first.needs_chunk(np.array([0])).all()  # it has never acted
+        env_ids = np.array([1])
+        needs.append(int(first.steps_to_prediction(env_ids)[0]))
+        first.act(env_ids, chunks[:0] if needs[-1] else chunks)
+    assert needs == [0, 2, 1, 0, 2, 1, 0]
+    assert not first.steps_to_prediction(np.array([0])).any()  # it has never acted
 
 
 @pytest.mark.parametrize("execute", [6, 100])
 def test_no_more_than_a_chunk_can_be_carried_out(execute: int) -> None:
-    with pytest.raises(RequestError, match=f"execute {execute}: must be 1 to 5"):
-        make_chunking(Acting(temporal_ensemble=False, execute=execute), 1, 5, 1)
+    with pytest.raises(RequestError, match=rf"\(--execute\) {execute}: must be 1 to 5"):
+        make_action_buffer(ActionExecution(temporal_ensemble=False, n_action_steps=execute), 1, 5, 1)

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
-from robo_manip_baselines.policy.presets import PolicyPreset, Sizes
+from robo_manip_baselines.policy.presets import PolicyPreset, PolicyDims
 from robo_manip_baselines.policy.registry import POLICIES, load_part, make_model
 
-SIZES = Sizes(state=29, action=7, cameras=0, image=(480, 640))
+DIMS = PolicyDims(state=29, action=7, cameras=0, image=(480, 640))
 CHUNK = 6
 
 
@@ -25,7 +25,7 @@ def make(policy: str) -> PolicyModel:
     """Build the policy of the preset ``cpu``, with a short chunk."""
     torch.manual_seed(0)
     config = dataclasses.replace(presets_of(policy)["cpu"].config, chunk_size=CHUNK)
-    return make_model(policy, config, SIZES)
+    return make_model(policy, config, DIMS)
 
 
 def make_batch(model: PolicyModel, size: int = 5) -> Batch:
@@ -33,9 +33,9 @@ def make_batch(model: PolicyModel, size: int = 5) -> Batch:
     generator = torch.Generator().manual_seed(1)
     is_pad = torch.arange(CHUNK)[None] >= torch.tensor([CHUNK, *range(1, size)])[:, None]
     return Batch(
-        state=torch.randn(size, SIZES.state, generator=generator),
+        state=torch.randn(size, DIMS.state, generator=generator),
         images=None,
-        action=torch.randn(size, CHUNK, SIZES.action, generator=generator),
+        action=torch.randn(size, CHUNK, DIMS.action, generator=generator),
         is_pad=is_pad,
         noise=torch.randn(size, model.noise_size, generator=generator),
         num_valid=(~is_pad).sum().float(),
@@ -85,7 +85,7 @@ def test_a_row_does_not_depend_on_the_others(policy: str) -> None:
     model = make(policy).eval()
     state = make_batch(model).state
     together = model.predict(state, None)
-    assert together.shape == (len(state), CHUNK, SIZES.action)
+    assert together.shape == (len(state), CHUNK, DIMS.action)
     assert together.dtype == torch.float32
     # Matrix products of other shapes add up in another order: a few float32 ulps of unit numbers.
     torch.testing.assert_close(together[2:3], model.predict(state[2:3], None), rtol=0, atol=1e-5)

@@ -7,7 +7,7 @@ import torch
 
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.observation.state import vector_names
-from robo_manip_baselines.training.sampling import StateNoise, noise_of
+from robo_manip_baselines.training.sampling import StateNoise, step_noise
 
 SPEC = ObservationSpec(obs="current_pred", horizon=3, cameras=(), object_pose=True)
 
@@ -45,7 +45,7 @@ def test_it_is_a_function_of_seed_and_step() -> None:
         other = noise.draw(seed, step, 5)
         assert other is not None
         assert not torch.equal(first, other)
-    assert not torch.equal(noise_of(7, "state", 3, 5, 15), noise_of(7, "noise", 3, 5, 15))
+    assert not torch.equal(step_noise(7, "state", 3, 5, 15), step_noise(7, "noise", 3, 5, 15))
 
 
 @pytest.mark.parametrize("obs", ["baseline", "current"])

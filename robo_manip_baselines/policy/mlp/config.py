@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from robo_manip_baselines.policy.presets import WITHOUT_IMAGES, Acting, PolicyPreset
+from robo_manip_baselines.policy.presets import STATE_ONLY_TRAINING, ActionExecution, PolicyPreset
 from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)
 class MlpConfig:
-    """What the perceptron is.
+    """Architecture of the perceptron.
 
     Attributes:
         chunk_size: K, actions predicted at once.
         hidden_size: width of each hidden layer.
-        hidden_layers: how many there are.
+        hidden_layers: number of hidden layers.
         dropout: before the last layer.
 
     Raises:
@@ -38,8 +38,8 @@ class MlpConfig:
 PRESETS = {
     "cpu": PolicyPreset(
         config=MlpConfig(),
-        training=replace(WITHOUT_IMAGES, batch_size=256),
-        acting=Acting(temporal_ensemble=False, execute=10),
+        training=replace(STATE_ONLY_TRAINING, batch_size=256),
+        execution=ActionExecution(temporal_ensemble=False, n_action_steps=10),
         cameras=(),
         object_pose=True,
     )
