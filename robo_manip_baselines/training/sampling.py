@@ -145,12 +145,20 @@ class StateNoise:
         spec: of the observations.
         robot: ``TrainSettings.state_noise``.
         clock: ``TrainSettings.clock_noise``.
+        observed: names of the task's target and objects.
     """
 
-    def __init__(self, spec: ObservationSpec, robot: float = 0.0, clock: float = 0.0) -> None:
-        names = spec.vector_names(ObservedNames())
+    def __init__(
+        self,
+        spec: ObservationSpec,
+        robot: float = 0.0,
+        clock: float = 0.0,
+        observed: ObservedNames | None = None,
+    ) -> None:
+        observed = observed or ObservedNames()
+        names = spec.vector_names(observed)
         self._size = len(names)
-        self._robot_size = len(spec.components(ObservedNames())["state"])  # they come first
+        self._robot_size = len(spec.components(observed)["state"])  # they come first
         self._times = [i for i, name in enumerate(names) if name.startswith("t_")]
         self._robot, self._clock = robot, clock
 

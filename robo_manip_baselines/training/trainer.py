@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.checkpoints import prune_checkpoints, step_folder
@@ -154,7 +155,10 @@ class Trainer:
             device=device,
             rank=processes.rank,
             world_size=processes.world_size,
-            state_noise=StateNoise(given.spec, settings.state_noise, settings.clock_noise),
+            state_noise=StateNoise(
+                *(given.spec, settings.state_noise, settings.clock_noise),
+                observed=task_entry(setup.config.env).names,
+            ),
             images=images,
         )
         self.held_out: HeldOutLoss | None = None
