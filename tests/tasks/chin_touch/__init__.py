@@ -1,0 +1,45 @@
+"""Chin touch: touch the chin of a person who moves with the closed gripper."""
+
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    FACE_ATTRIBUTES,
+    FACE_FIELDS,
+    Field,
+    ResultColumn,
+    TaskEntry,
+)
+from robo_manip_baselines.observation import ObservedNames
+
+ENTRY = TaskEntry(
+    name="ChinTouchEnv",
+    env="chin_touch.env:ChinTouchEnv",
+    max_episode_steps=400,  # 8 s
+    experts={"reactive": "chin_touch.expert:ChinTouchExpert"},
+    metrics="chin_touch.metrics:ChinTouchMetrics",
+    failures={
+        "too_far": "the gripper was never within 0.03 m of the chin",
+        "no_contact": "it was, and never touched the face there",
+    },
+    names=ObservedNames(target="chin"),
+    target_field="chin_position",
+    predicted_field="",  # predictors forecast the mouth
+    fields=(
+        *FACE_FIELDS,
+        Field(
+            "chin_position",
+            ("T", 6, 3),
+            "float64",
+            "m",
+            "world",
+            "True chin now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
+        ),
+    ),
+    attributes=FACE_ATTRIBUTES,
+    columns=(
+        ResultColumn("chin_distance", "float", "m, smallest distance gripper-chin"),
+        ResultColumn(
+            "face_force", "float", "N, largest normal force between robot and face", in_report=True
+        ),
+    ),
+    success="the gripper touched the face within 0.03 m of the chin",
+    strict_success="and never pressed it with more than 5 N",
+)
