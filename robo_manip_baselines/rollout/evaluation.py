@@ -378,7 +378,7 @@ def _effective(execution: ActionExecution) -> dict[str, Any]:
     """Return the settings that make a difference, in the names of ``evaluation.json``."""
     if execution.temporal_ensemble:
         return {"temporal_ensemble": True, "decay": execution.ensemble_decay}
-    return {"temporal_ensemble": False, "execute": execution.execute}
+    return {"temporal_ensemble": False, "execute": execution.n_action_steps}
 
 
 def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> None:
