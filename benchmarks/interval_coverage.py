@@ -1,7 +1,7 @@
-"""How often a benchmark's 95 % intervals hold the truth, and how often its tests cry wolf.
+"""Coverage of a benchmark's 95 % intervals, and false positives of its tests, by simulation.
 
-Made-up benchmarks in which all is known: episodes are hard or easy for everybody, and training runs
-are better or worse by luck.
+In the simulated benchmarks all conditions are equally good, episodes are hard or easy for all of
+them, and training runs are better or worse by luck.
 
     python benchmarks/interval_coverage.py
 """
@@ -13,9 +13,9 @@ import argparse
 import numpy as np
 from tqdm import tqdm
 
-from robo_manip_baselines.benchmark.statistics.comparison import paired_success
-from robo_manip_baselines.benchmark.statistics.intervals import rate_estimate
-from robo_manip_baselines.rollout.results import share
+from robo_manip_baselines.benchmark.statistics.inference import paired_success
+from robo_manip_baselines.benchmark.statistics.inference import rate_estimate
+from robo_manip_baselines.rollout.results import Proportion
 
 DIFFICULTY = 1.2
 """Standard deviation of the episodes' log-odds: from 1 in 7 to 6 in 7 at one of them."""
@@ -24,11 +24,13 @@ MIDDLE = 0.6
 """Log-odds of an average run in an average episode."""
 
 
-def draw(rng: np.random.Generator, arms: int, runs: int, episodes: int, luck: float) -> np.ndarray:
-    """Draw outcomes (arms, runs, episodes) of arms that are equally good."""
+def draw(
+    rng: np.random.Generator, conditions: int, runs: int, episodes: int, luck: float
+) -> np.ndarray:
+    """Draw outcomes (conditions, runs, episodes) of conditions that are equally good."""
     odds = (
         MIDDLE
-        + luck * rng.normal(size=(arms, runs, 1))
+        + luck * rng.normal(size=(conditions, runs, 1))
         + DIFFICULTY * rng.normal(size=(1, 1, episodes))
     )
     return (rng.random(odds.shape) < 1.0 / (1.0 + np.exp(-odds))).astype(float)
@@ -37,7 +39,7 @@ def draw(rng: np.random.Generator, arms: int, runs: int, episodes: int, luck: fl
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--benchmarks", type=int, default=500, help="made up for each row")
+    parser.add_argument("--benchmarks", type=int, default=500, help="simulated for each row")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--resamples", type=int, default=300)
     options = parser.parse_args()
@@ -54,7 +56,7 @@ def main() -> None:
             for _ in tqdm(range(options.benchmarks), leave=False):
                 ours, theirs = draw(rng, 2, runs, options.episodes, luck)
                 rate = rate_estimate(ours, rng, options.resamples)
-                pooled = share(int(ours.sum()), ours.size)
+                pooled = Proportion.of(int(ours.sum()), ours.size)
                 pairs = paired_success(ours, theirs, rng, options.resamples)
                 hits += (
                     (rate.low or 0.0) <= truth <= (rate.high or 1.0),
@@ -62,8 +64,8 @@ def main() -> None:
                     (pairs.difference.low or 0.0) <= 0.0 <= (pairs.difference.high or 0.0),
                     (pairs.p or 1.0) < 0.05,
                 )
-            shares = " | ".join(f"{100 * hit / options.benchmarks:.0f} %" for hit in hits)
-            print(f"| {luck:g} | {runs} | {shares} |", flush=True)
+            rates = " | ".join(f"{100 * hit / options.benchmarks:.0f} %" for hit in hits)
+            print(f"| {luck:g} | {runs} | {rates} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Plots as SVG: the same bytes for the same figures, in the colours of the page around them.
+"""Figures of a benchmark as SVG: the same bytes for the same statistics.
 
 Matplotlib is imported where something is drawn.
 """
@@ -7,37 +7,68 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from robo_manip_baselines.benchmark.statistics.analysis import (
+    BenchmarkStatistics,
+    ConditionStatistics,
+)
+from robo_manip_baselines.benchmark.statistics.conditions import (
+    BASELINE,
+    CURRENT,
+    PREDICTION,
+    WITH_ERROR,
+)
+from robo_manip_baselines.envs.mujoco.tasks.registry import EpisodeFigure
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+from robo_manip_baselines.runs.files import write_text
 
 INK = "#1f2328"
-"""of axes and words; a page may put its own colour in place of it."""
+"""Color of axes and text; a page may put its own in its place."""
 
 BLUE, ORANGE, GREEN, RED = "#0072b2", "#e69f00", "#009e73", "#d55e00"
 SKY, PINK, YELLOW, GREY = "#56b4e9", "#cc79a7", "#f0e442", "#8c8c8c"
-"""Colours that colour-blind readers can tell apart (Okabe and Ito)."""
+"""Colors that color-blind readers can tell apart (Okabe and Ito)."""
+
+FAILURE_COLORS = (GREY, PINK, BLUE, SKY, RED, ORANGE, YELLOW)
+"""Colors of the kinds of failure in their order; further kinds are hatched."""
+
+MANY_POINTS = 3000
+"""More points are drawn as pixels: as shapes they would make the file large."""
+
+HORIZON_LABEL = "horizon, frames of 1/30 s"
+
+_INK_OF = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
+_STYLE: Any = {
+    **dict.fromkeys(_INK_OF, INK),
+    "axes.facecolor": "none",
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "font.size": 10.0,
+    "grid.alpha": 0.3,
+    "grid.color": GREY,
+    "legend.facecolor": "none",
+    "legend.framealpha": 0.0,
+    "svg.fonttype": "none",
+}
 
 
 @dataclass(frozen=True)
-class Plot:
-    """A plot.
+class ReportFigure:
+    """Figure of a report.
 
     Attributes:
-        name: of its file, without ending.
+        name: of its file, without extension.
         title: above it.
-        caption: what is drawn.
-        summary: what is to be seen, for readers who cannot see it.
-        svg: the picture, a whole SVG document.
+        caption: below it.
+        summary: for readers who cannot see it.
+        svg: a whole SVG document.
     """
 
     name: str
@@ -48,7 +79,7 @@ class Plot:
 
     @property
     def inline(self) -> str:
-        """The picture as an element of a page: names of its own, ink as the text around it."""
+        """SVG element of a page, with identifiers of its own, in the color of the page's text."""
         svg = self.svg[self.svg.index("<svg") :].replace(INK, "currentColor")
         svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
         svg = re.sub(r'\bid="', f'id="{self.name}-', svg)
@@ -58,17 +89,20 @@ class Plot:
         return svg.replace("<svg", f"<svg {label}", 1)
 
 
-@contextmanager
-def new_figure(name: str, width: float, height: float) -> Iterator[tuple[Figure, Any]]:
-    """Give an empty figure in the report's look, and where its SVG will stand.
+Draw = Callable[[Any, BenchmarkStatistics], tuple[str, str]]
+"""Draws statistics into an empty Matplotlib figure; returns caption and summary."""
+
+
+def render_figure(
+    name: str, title: str, draw: Draw, statistics: BenchmarkStatistics
+) -> ReportFigure:
+    """Draw a figure in the style of the report.
 
     Args:
-        name: of the plot; its identifiers are made from it.
-        width: inches.
-        height: inches.
-
-    Yields:
-        The figure and an `io.StringIO` that holds the SVG when the block has ended.
+        name: of the figure; identifiers in the SVG are made from it.
+        title: above it.
+        draw: draws it.
+        statistics: that it shows.
 
     Raises:
         RequestError: matplotlib is not installed.
@@ -79,39 +113,243 @@ def new_figure(name: str, width: float, height: float) -> Iterator[tuple[Figure,
         from matplotlib.figure import Figure
     except ImportError as error:
         raise RequestError(
-            f"plots need matplotlib ({error}); pip install 'robo_manip_baselines[train]'"
+            f"figures need matplotlib ({error}); pip install 'robo_manip_baselines[train]'"
         ) from None
-    colours = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
-    look: Any = {
-        **dict.fromkeys(colours, INK),
-        "axes.facecolor": "none",
-        "axes.spines.right": False,
-        "axes.spines.top": False,
-        "font.size": 10.0,
-        "grid.alpha": 0.3,
-        "grid.color": GREY,
-        "legend.facecolor": "none",
-        "legend.framealpha": 0.0,
-        "svg.fonttype": "none",
-        "svg.hashsalt": name,
-    }
     stream = io.StringIO()
-    with mpl.rc_context(look):
-        figure = Figure(figsize=(width, height), layout="constrained", facecolor="none")
+    with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):
+        figure = Figure(layout="constrained", facecolor="none")
         FigureCanvasSVG(figure)
-        yield figure, stream
+        caption, summary = draw(figure, statistics)
         figure.savefig(stream, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
+    return ReportFigure(name, title, caption, summary, stream.getvalue())
 
 
-def write_plots(folder: Path, plots: Sequence[Plot]) -> list[Path]:
-    """Write every plot as an SVG on white; return the paths."""
-    paths = []
-    for plot in plots:
-        path = folder / f"{plot.name}.svg"
-        with atomic_file(path) as temporary:
-            # Ink is dark: a page in the dark would swallow it.
-            start = plot.svg.index(">", plot.svg.index("<svg")) + 1
-            ground = '<rect width="100%" height="100%" fill="#ffffff"/>'
-            temporary.write_text(plot.svg[:start] + ground + plot.svg[start:], encoding="utf-8")
-        paths.append(path)
+def benchmark_figures(statistics: BenchmarkStatistics) -> tuple[ReportFigure, ...]:
+    """Draw all figures for which there are conditions.
+
+    Raises:
+        RequestError: matplotlib is not installed.
+    """
+    figures: list[tuple[str, str, Draw]] = [
+        ("success_by_horizon", "Success against the horizon", draw_success_by_horizon),
+        ("completion_times", "Completion times", draw_completion_times),
+        *((f.name, f.title, draw_episodes(f)) for f in statistics.study.figures),
+        ("failures", "How episodes ended", draw_failures),
+    ]
+    if any(c.condition.delay for c in statistics.conditions):
+        title = "Success against delay and horizon"
+        figures.append(("delay_and_horizon", title, draw_delay_and_horizon))
+    return tuple(render_figure(*figure, statistics) for figure in figures)
+
+
+def write_figures(folder: Path, figures: Sequence[ReportFigure]) -> list[Path]:
+    """Write every figure as an SVG on white; return the paths."""
+    paths = [folder / f"{figure.name}.svg" for figure in figures]
+    for path, figure in zip(paths, figures, strict=True):
+        # Ink is dark: it would not be visible on a dark page.
+        start = figure.svg.index(">", figure.svg.index("<svg")) + 1
+        background = '<rect width="100%" height="100%" fill="#ffffff"/>'
+        write_text(path, figure.svg[:start] + background + figure.svg[start:])
     return paths
+
+
+def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
+    """Draw success against the horizon, with and without error, and published results."""
+    figure.set_size_inches(8.0, 4.6)
+    axes, study = figure.add_subplot(), statistics.study
+    last = 0
+    for group, error, color, label, shift in (
+        (BASELINE, "none", GREY, "", 0.12),
+        (CURRENT, "none", INK, "", 0.12),
+        (PREDICTION, "none", BLUE, "without error", -0.06),
+        (PREDICTION, WITH_ERROR, ORANGE, "with error", 0.06),
+    ):
+        own = [
+            c
+            for c in statistics.conditions
+            if (c.condition.group, c.condition.error) == (group, error)
+        ]
+        if not own:
+            continue
+        x = np.array([-1 if (h := c.condition.horizon) is None else h for c in own])
+        rate, low, high = (
+            100.0
+            * np.array(
+                [(c.success.rate, c.success.low, c.success.high) for c in own], dtype=np.float64
+            ).T
+        )
+        style: Any = {"color": color, "label": f"prediction {label}" if label else None}
+        if len(x) > 1:
+            axes.fill_between(x, low, high, color=color, alpha=0.18, lw=0)
+            axes.plot(x, rate, "o-", **style)
+        else:  # a band of one horizon has no width
+            place = x + shift / 2 if label else x
+            axes.errorbar(place, rate, [rate - low, high - rate], fmt="o", capsize=4, **style)
+        there = [
+            (place + shift, 100.0 * c.published.successes / study.trials)
+            for place, c in zip(x, own, strict=True)
+            if c.published
+        ]
+        if there:
+            style = {"mfc": "none", "mec": color, "ms": 6, "ls": "none"}
+            theirs = f"paper, {label}" if label else None
+            axes.plot(*zip(*there, strict=True), marker="D", label=theirs, **style)
+        last = max(last, *x)
+    ticks = range(-1, last + 1)
+    axes.set_xticks(ticks, ["baseline", "current", *map(str, ticks[2:])])
+    axes.set(xlabel=HORIZON_LABEL, ylabel="success, %", xlim=(-1.4, last + 0.4), ylim=(0.0, 100.0))
+    axes.grid(axis="y")
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="lower right", ncols=2, fontsize=9)
+    seeds = (
+        " over training and evaluation seeds" if statistics.has_many_train_seeds else " (Wilson)"
+    )
+    caption = f"Bands and bars: 95 % intervals{seeds}."
+    if _has_published(statistics):
+        caption += f" Hollow markers: {_paper(study.success_table)}, {study.trials} episodes each."
+    best = max(statistics.conditions, key=lambda c: c.success.rate or 0.0)
+    return caption, f"The highest rate is that of “{best.condition.label}”, {best.success}."
+
+
+def draw_completion_times(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
+    """Draw the completion times of successes, one row for each condition."""
+    conditions = statistics.conditions
+    figure.set_size_inches(8.0, 0.9 + 0.34 * len(conditions))
+    axes = figure.add_subplot()
+    rng = np.random.default_rng(0)  # scatters points up and down, so that they can be told apart
+    many = sum(c.time.n for c in conditions) > MANY_POINTS
+    for row, c in enumerate(conditions):
+        times = c.outcomes.time[np.isfinite(c.outcomes.time)]
+        dots: Any = {"color": SKY, "alpha": 0.55, "ms": 4, "mew": 0, "zorder": 1}
+        places = row + rng.uniform(-0.25, 0.25, times.size)
+        axes.plot(times, places, ".", rasterized=many, **dots)
+        if c.time.low is not None:
+            axes.plot([c.time.low, c.time.high], [row, row], color=INK, lw=2, zorder=3)
+        if c.time.mean is not None:
+            axes.plot(c.time.mean, row, "o", color=INK, ms=5, zorder=3)
+        if c.published:
+            there = c.published.completion_time
+            axes.plot(there, row, "D", mfc="none", mec=RED, ms=6, zorder=4)
+    _label_rows(axes, conditions)
+    axes.set_xlabel(f"{statistics.task.completion_time}, s")
+    axes.grid(axis="x")
+    caption = "Light dots: successful episodes. Dark: mean and 95 % interval (bootstrap)."
+    if _has_published(statistics):
+        caption += f" Hollow diamonds: {_paper(statistics.study.time_table)}."
+    means = [(c.time.mean, c.condition.label) for c in conditions if c.time.mean is not None]
+    if not means:
+        return caption, "No episode succeeded."
+    mean, label = min(means, key=lambda found: found[0])
+    return caption, f"The shortest mean is that of {label}, {mean:.2f} s."
+
+
+def draw_episodes(episode_figure: EpisodeFigure) -> Draw:
+    """Return the function that draws a task's figure, one panel for each condition."""
+
+    def draw(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
+        conditions = statistics.conditions
+        columns = min(4, len(conditions))
+        rows = -(-len(conditions) // columns)
+        figure.set_size_inches(2.2 * columns, 2.45 * rows + 0.3)
+        many = sum(len(c.rows) for c in conditions) > MANY_POINTS
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+        for axes in panels[len(conditions) :]:
+            axes.set_axis_off()
+        for axes, c in zip(panels, conditions, strict=False):
+            results = [row.result for row in c.rows]
+            values = [{**r.columns, "is_success": r.is_success} for r in results]
+            episode_figure.draw(axes, values, many)
+            axes.set_title(_in_two_lines(c.condition.label), fontsize=9)
+        figure.supxlabel(episode_figure.xlabel, fontsize=10)
+        figure.supylabel(episode_figure.ylabel, fontsize=10)
+        return episode_figure.caption, episode_figure.summary
+
+    return draw
+
+
+def draw_failures(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
+    """Draw the proportions of the kinds of failure, one bar for each condition."""
+    conditions = statistics.conditions
+    figure.set_size_inches(8.0, 1.3 + 0.34 * len(conditions))
+    axes = figure.add_subplot()
+    counts = [Counter(row.result.failure for row in c.rows) for c in conditions]
+    left = np.zeros(len(conditions))
+    for number, kind in enumerate(("", *statistics.task.failures), start=-1):
+        percent = np.array([100.0 * count[kind] / count.total() for count in counts])
+        color = FAILURE_COLORS[number % len(FAILURE_COLORS)] if kind else GREEN
+        label = kind.replace("_", " ") or "success"
+        bars: Any = {"left": left, "color": color, "height": 0.75, "label": label}
+        hatch = "///" if number >= len(FAILURE_COLORS) else None
+        axes.barh(range(len(conditions)), percent, hatch=hatch, **bars)
+        left += percent
+    _label_rows(axes, conditions)
+    axes.set(xlim=(0.0, 100.0), xlabel="episodes, %")
+    figure.legend(loc="outside lower center", ncols=4, fontsize=9)
+    failures = sum(counts, Counter())
+    del failures[""]
+    summary = "No episode failed."
+    if failures:
+        ((kind, count),) = failures.most_common(1)
+        summary = (
+            "The most frequent failure of all conditions is "
+            f"{kind.replace('_', ' ')}, {count} episodes."
+        )
+    return "Kinds of failure as defined in the table.", summary
+
+
+def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
+    """Draw success over delay and horizon as a heat map with numbers.
+
+    Only conditions without error, or, if none of those is delayed, with the first error that is.
+    """
+    errors = {c.condition.error for c in statistics.conditions if c.condition.delay}
+    error = min(errors, key=lambda error: (error != "none", error))
+    rates = {
+        (c.condition.delay, c.condition.horizon): 100.0 * (c.success.rate or 0.0)
+        for c in statistics.conditions
+        if c.condition.error == error and c.condition.horizon is not None
+    }
+    delays, horizons = (sorted({key[place] for key in rates}) for place in (0, 1))
+    grid = np.array([[rates.get((d, h), np.nan) for h in horizons] for d in delays])
+    figure.set_size_inches(1.6 + 0.9 * len(horizons), 1.2 + 0.6 * len(delays))
+    axes = figure.add_subplot()
+    colors: Any = {"cmap": "cividis", "vmin": 0.0, "vmax": 100.0}
+    image = axes.imshow(grid, origin="lower", aspect="auto", **colors)
+    for (row, column), rate in np.ndenumerate(grid):
+        if np.isfinite(rate):
+            color = "#000000" if rate > 50.0 else "#ffffff"
+            axes.text(column, row, f"{rate:.0f}", ha="center", va="center", color=color)
+    axes.set_xticks(range(len(horizons)), [str(h) if h else "current" for h in horizons])
+    axes.set_yticks(range(len(delays)), map(str, delays))
+    axes.set(xlabel=HORIZON_LABEL, ylabel="delay, frames")
+    figure.colorbar(image, ax=axes, label="success, %")
+    caption = "Empty where no such condition was evaluated."
+    if error != "none":
+        caption += f" Conditions with {error} error."
+    delay, horizon = min(rates, key=lambda key: (rates[key], key))
+    return (
+        caption,
+        f"The lowest rate, {rates[delay, horizon]:.0f} %, is at a delay of {delay} frames and a "
+        f"horizon of {horizon}.",
+    )
+
+
+def _has_published(statistics: BenchmarkStatistics) -> bool:
+    return any(c.published for c in statistics.conditions)
+
+
+def _paper(table: str) -> str:
+    return f"the paper's {table or 'results'}"
+
+
+def _label_rows(axes: Any, conditions: Sequence[ConditionStatistics]) -> None:
+    """Label the rows of a figure with conditions, the first one on top."""
+    axes.set_yticks(range(len(conditions)), [c.condition.label for c in conditions])
+    axes.set_ylim(len(conditions) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+
+
+def _in_two_lines(label: str) -> str:
+    """Break a long label at its first comma."""
+    head, comma, tail = label.partition(", ")
+    return f"{head}\n{tail}" if comma and len(label) > 18 else label

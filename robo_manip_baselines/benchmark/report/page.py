@@ -1,4 +1,4 @@
-"""Videos of episodes, small enough for dozens of them to travel in one page."""
+"""Report of a benchmark: one HTML page with tables, figures, videos and result rows."""
 
 from __future__ import annotations
 
@@ -6,32 +6,31 @@ import base64
 import json
 import tempfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
 
-import av
-import cv2
 import numpy as np
 
-from robo_manip_baselines.benchmark.report.figures import Plot
-from robo_manip_baselines.benchmark.report.plots import benchmark_plots
-from robo_manip_baselines.benchmark.statistics.outcomes import Line, Selection
-from robo_manip_baselines.benchmark.statistics.study import ArmFigures, Study
-from robo_manip_baselines.benchmark.tables.study import study_tables
+from robo_manip_baselines.benchmark.report.figures import ReportFigure, benchmark_figures
+from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics
+from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, RowSelection
+from robo_manip_baselines.benchmark.tables.benchmark import benchmark_tables
 from robo_manip_baselines.benchmark.tables.table import Table
-from robo_manip_baselines.rollout.videos import VideoWriter
+from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.files import write_text
 
-WIDTH = 1280
-"""pixels at most: as wide as the page."""
+FOLDER = Path(__file__).parent
+
+VIDEO_WIDTH = 1280
+"""Pixels at most: the width of the page."""
 
 FRAME_STEP = 2
-"""Of so many frames one is kept: 12.5 in a second."""
+"""One frame of so many is kept: 12.5 in a second."""
 
-QUALITY = 30
+VIDEO_QUALITY = 30
 """crf of libx264; with the above, 12 s of four views are a tenth of what an evaluation writes."""
 
 POSTER_QUALITY = 80
@@ -40,137 +39,128 @@ POSTER_QUALITY = 80
 
 @dataclass(frozen=True)
 class EpisodeVideo:
-    """The video of an episode.
+    """Video of an episode.
 
     Attributes:
-        line: what the episode came to.
+        row: result of the episode.
         content: an mp4 file, H.264.
-        poster: a JPEG file, shown before it plays: the last frame, which says how it ended.
+        poster: a JPEG file of the last frame, shown before the video plays.
     """
 
-    line: Line
+    row: ResultRow
     content: bytes
     poster: bytes
 
 
-def episodes_to_show(study: Study) -> tuple[Line, ...]:
-    """Pick the episodes whose videos a report wants: of each arm a success and a failure.
+def episodes_to_show(statistics: BenchmarkStatistics) -> tuple[ResultRow, ...]:
+    """Pick the episodes whose videos a report shows: of each condition a success and a failure.
 
     The first by training seed, then by seed, so that nobody has chosen them. Of failures, the first
     of the most frequent kind.
     """
-    picked: list[Line] = []
-    for figures in study.arms:
-        lines = sorted(
-            figures.lines, key=lambda line: (line.result.train_seed or 0, line.result.seed)
-        )
-        kinds = [line.result.failure for line in lines if not line.result.is_success]
-        wanted = ["", max(kinds, key=kinds.count)] if kinds else [""]
-        for kind in wanted:
-            picked += [line for line in lines if line.result.failure == kind][:1]
+    picked: list[ResultRow] = []
+    for condition in statistics.conditions:
+        rows = sorted(condition.rows, key=lambda r: (r.result.train_seed or 0, r.result.seed))
+        kinds = [row.result.failure for row in rows if not row.result.is_success]
+        for kind in ["", max(kinds, key=kinds.count)] if kinds else [""]:
+            picked += [row for row in rows if row.result.failure == kind][:1]
     return tuple(picked)
 
 
-def read_video(path: Path, line: Line) -> EpisodeVideo:
+def read_video(path: Path, row: ResultRow) -> EpisodeVideo:
     """Read the video of an episode and make it small.
 
     Args:
-        path: as evaluations write it, see ``policy_video``.
-        line: what the episode came to.
+        path: of a video that an evaluation has written.
+        row: result of the episode.
 
     Raises:
         RequestError: there is none, or it cannot be played.
     """
+    # Imported here: they load the simulator.
+    import av
+    import cv2
+
+    from robo_manip_baselines.rollout.videos import VideoWriter
+
     try:
         with tempfile.TemporaryDirectory() as folder, av.open(str(path)) as source:
             small = Path(folder) / "small.mp4"
             (track,) = source.streams.video
             rate = float(track.average_rate or 0) / FRAME_STEP
-            width = min(WIDTH, track.width)
-            height = round(width * track.height / track.width)
+            width = min(VIDEO_WIDTH, track.width)
+            size = (width, round(width * track.height / track.width))
             image = np.empty((0, 0, 3), dtype=np.uint8)
-            with VideoWriter(small, rate, crf=QUALITY) as video:
+            with VideoWriter(small, rate, crf=VIDEO_QUALITY) as video:
                 for number, frame in enumerate(source.decode(track)):
                     if number % FRAME_STEP == 0:
                         full = frame.to_ndarray(format="rgb24")
-                        image = np.asarray(
-                            cv2.resize(full, (width, height), interpolation=cv2.INTER_AREA)
-                        )
+                        image = np.asarray(cv2.resize(full, size, interpolation=cv2.INTER_AREA))
                         video.write(image)
-            return EpisodeVideo(line, small.read_bytes(), _jpeg(image))
+            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, POSTER_QUALITY])[1]
+            return EpisodeVideo(row, small.read_bytes(), jpeg.tobytes())
     except (OSError, ValueError) as error:  # PyAV's errors are of these kinds
         raise RequestError(
             f"video '{path}' cannot be read ({error}); evaluate with --video, or leave it out"
         ) from error
 
 
-def _jpeg(image: np.ndarray) -> bytes:
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, POSTER_QUALITY])[1].tobytes()
-
-
 @dataclass(frozen=True, eq=False)
-class ReportData:
-    """All that a report shows.
+class Report:
+    """Content of a report.
 
     Attributes:
         title: of the page.
-        study: the figures.
-        tables: made from it.
-        plots: likewise.
-        videos: of episodes of its arms.
-        facts: what else to say at the top, such as the command and the machine: name -> text.
+        statistics: of the benchmark.
+        tables, figures: made from them.
+        videos: of episodes.
+        facts: at the top, such as the command and the machine: name -> text.
     """
 
     title: str
-    study: Study
+    statistics: BenchmarkStatistics
     tables: tuple[Table, ...]
-    plots: tuple[Plot, ...]
+    figures: tuple[ReportFigure, ...]
     videos: tuple[EpisodeVideo, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
 
 
-def report_data(
-    study: Study,
-    *,
+def make_report(
+    statistics: BenchmarkStatistics,
     title: str,
     videos: Iterable[EpisodeVideo] = (),
     facts: Mapping[str, str] | None = None,
-) -> ReportData:
-    """Make tables and plots of a study.
+) -> Report:
+    """Make the tables and figures of a report.
 
     Raises:
         RequestError: matplotlib is not installed.
     """
-    return ReportData(
-        title, study, study_tables(study), benchmark_plots(study), tuple(videos), facts or {}
-    )
+    tables, figures = benchmark_tables(statistics), benchmark_figures(statistics)
+    return Report(title, statistics, tables, figures, tuple(videos), facts or {})
 
 
-FOLDER = Path(__file__).parent
-
-
-def write_report(path: Path, data: ReportData) -> None:
+def write_report(path: Path, report: Report) -> None:
     """Write a report.
 
     Args:
-        path: of the page, usually ``report.html`` in the folder that the result lines' files are
-            told relative to.
-        data: what it shows.
+        path: of the page, usually ``report.html`` in the folder that the files of the result rows
+            are relative to.
+        report: its content.
 
     Raises:
         RequestError: Jinja is not installed, or the file cannot be written.
     """
-    page = render_report(data)
+    page = render_report(report)
     try:
-        with atomic_file(path) as temporary:
-            temporary.write_text(page, encoding="utf-8")
+        write_text(path, page)
     except OSError as error:
         raise RequestError(f"cannot write '{path}': {error.strerror}; name another file") from error
 
 
-def render_report(data: ReportData) -> str:
-    """Return a report as HTML. The same data give the same page.
+def render_report(report: Report) -> str:
+    """Return a report as HTML. The same report gives the same page.
 
     Raises:
         RequestError: Jinja is not installed.
@@ -188,114 +178,116 @@ def render_report(data: ReportData) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["link"] = link
-    environment.filters["sort_key"] = sort_key
-    page = environment.get_template("report.html.jinja")
-    return page.render(
-        data=data,
-        facts={**study_facts(data.study), **data.facts},
+    environment.filters |= {"link": link, "sort_key": sort_key, "base64": _base64}
+    statistics = report.statistics
+    videos: dict[str, list[EpisodeVideo]] = {c.condition.name: [] for c in statistics.conditions}
+    for video in sorted(report.videos, key=lambda video: not video.row.result.is_success):
+        videos[video.row.result.condition].append(video)
+    rows = row_data(statistics)
+    return environment.get_template("report.html.jinja").render(
+        report=report,
+        statistics=statistics,
+        facts={**general_facts(statistics), **report.facts},
         style=(FOLDER / "report.css").read_text(encoding="utf-8"),
         script=(FOLDER / "report.js").read_text(encoding="utf-8"),
-        lines=embedded(lines_of(data.study)),
-        arms=[_videos(figures, data.videos) for figures in data.study.arms],
+        columns=rows["columns"],
+        rows=embedded(rows),
+        videos=videos,
     )
 
 
-def link(selection: Selection) -> str:
-    """Return the fragment that makes the page list the lines of a selection."""
-    query: dict[str, str] = {"arm": selection.arm}
-    if selection.versus:
-        query["versus"] = ",".join(map(quote, selection.versus))
-    for name in ("train_seed", "is_success", "is_strict", "within", "failure"):
-        value = getattr(selection, name)
-        if value is not None:
-            query[name] = str(value).lower() if isinstance(value, bool) else str(value)
-    if selection.is_different:
-        query["is_different"] = "true"
-    return f"#lines?{urlencode(query)}"
+def link(selection: RowSelection) -> str:
+    """Return the fragment of an address that makes the page list the selected rows."""
+    query: dict[str, str] = {}
+    for name, value in asdict(selection).items():
+        if name == "versus" and value:
+            query[name] = ",".join(map(quote, value))
+        elif isinstance(value, bool) and (value or name != "is_different"):
+            query[name] = str(value).lower()
+        elif isinstance(value, str | int | float) and not isinstance(value, bool):
+            query[name] = str(value)
+    return f"#rows?{urlencode(query)}"
 
 
 def sort_key(value: object) -> str:
-    """Return what a column is sorted by; empty for what comes last."""
+    """Return the key that a table cell is sorted by; empty comes last."""
     if value is None:
         return ""
     return repr(float(value)) if isinstance(value, int | float) else str(value)
 
 
-def study_facts(study: Study) -> dict[str, str]:
-    """Return what can be said of all episodes together."""
-    results = [line.result for figures in study.arms for line in figures.lines]
-    train_seeds = [str(seed) for seed in study.train_seeds if seed is not None]
+def general_facts(statistics: BenchmarkStatistics) -> dict[str, str]:
+    """Return facts about all episodes together."""
+    results = [row.result for c in statistics.conditions for row in c.rows]
+    seeds = statistics.seeds
     versions: dict[str, set[str]] = {}
     for result in results:
         for name, version in result.versions.items():
             versions.setdefault(name, set()).add(version)
     facts = {
         "Environment": ", ".join(sorted({r.env for r in results})),
-        "Episodes": f"{len(results)} of {len(study.arms)} arms",
-        "Training seeds": ", ".join(train_seeds) or "none",
-        "Evaluation seeds": f"{len(study.seeds)} that all arms have"
-        + (f", from {study.seeds[0]} to {study.seeds[-1]}" if study.seeds else ""),
+        "Episodes": f"{len(results)} of {len(statistics.conditions)} conditions",
+        "Training seeds": ", ".join(str(s) for s in statistics.train_seeds if s is not None)
+        or "none",
+        "Evaluation seeds": f"{len(seeds)} that all conditions have"
+        + (f", from {seeds[0]} to {seeds[-1]}" if seeds else ""),
         "Recorded motion": f"{len({r.motion_clip for r in results})} clips of "
         f"{len({r.motion_subject for r in results})} people",
     }
     if versions:
-        spelt = (f"{name} {' and '.join(sorted(versions[name]))}" for name in sorted(versions))
-        facts["Versions"] = ", ".join(spelt)
+        facts["Versions"] = ", ".join(
+            f"{name} {' and '.join(sorted(found))}" for name, found in sorted(versions.items())
+        )
     return facts
 
 
-def lines_of(study: Study) -> dict[str, Any]:
-    """Return the result lines as the page's script reads them: a table by columns, m as mm."""
-    lines = [line for figures in study.arms for line in figures.lines]
-    files = sorted({line.file for line in lines})
-    places = {file: number for number, file in enumerate(files)}
-
-    def row(line: Line) -> list[Any]:
-        r = line.result
-        offset = r.closest_offset and [round(1000.0 * part, 1) for part in r.closest_offset]
-        return [
-            places[line.file],
-            line.number,
-            r.arm,
-            r.train_seed,
-            r.seed,
-            r.is_success,
-            r.is_success_strict,
-            r.completion_time,
-            r.failure,
-            offset,
-            round(r.face_force, 2),
-            r.motion_clip,
-        ]
-
-    return {"files": files, "rows": [row(line) for line in lines]}
-
-
-def embedded(content: Mapping[str, Any]) -> str:
-    """Return JSON that can stand in a script element."""
-    text = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c")
-
-
-def _videos(figures: ArmFigures, videos: tuple[EpisodeVideo, ...]) -> dict[str, Any]:
-    """Return what the page shows of an arm's videos, successes first."""
-    own = [video for video in videos if video.line.result.arm == figures.arm.name]
-    own.sort(key=lambda video: not video.line.result.is_success)
+def row_data(statistics: BenchmarkStatistics) -> dict[str, Any]:
+    """Return the result rows as the page's script reads them, in a compact form."""
+    columns = [column for column in statistics.task.columns if column.in_report]
+    rows = [row for c in statistics.conditions for row in c.rows]
+    files = sorted({row.file for row in rows})
     return {
-        "arm": figures.arm,
-        "videos": [
-            {
-                "line": video.line,
-                "result": video.line.result,
-                "outcome": video.line.result.failure.replace("_", " ") or "success",
-                "source": _data_address("video/mp4", video.content),
-                "poster": _data_address("image/jpeg", video.poster),
-            }
-            for video in own
+        "files": files,
+        "columns": [_heading(column) for column in columns],
+        "rows": [
+            [
+                files.index(row.file),
+                row.number,
+                r.condition,
+                r.train_seed,
+                r.seed,
+                r.is_success,
+                r.is_success_strict,
+                r.completion_time,
+                r.failure,
+                r.motion_clip,
+                *(_shown(column, r.columns[column.name]) for column in columns),
+            ]
+            for row in rows
+            for r in [row.result]
         ],
     }
 
 
-def _data_address(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+def _heading(column: ResultColumn) -> str:
+    """Return the heading of a task's column; lengths are in mm."""
+    unit = "mm" if column.unit == "m" else column.unit
+    return column.name.replace("_", " ").capitalize() + (f", {unit}" if unit else "")
+
+
+def _shown(column: ResultColumn, value: Any) -> Any:
+    """Return a value in the unit of the heading, with the digits that the page shows."""
+    if value is None:
+        return None
+    shown = np.round(np.multiply(value, 1000.0 if column.unit == "m" else 1.0), 2)
+    return shown.tolist()
+
+
+def embedded(content: Mapping[str, Any]) -> str:
+    """Return JSON that is safe in a script element."""
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()

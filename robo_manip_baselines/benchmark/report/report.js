@@ -34,100 +34,104 @@ for (const button of document.querySelectorAll("table.sortable thead button")) {
   button.addEventListener("click", () => sortTable(button.closest("th")));
 }
 
-// Result lines: a link such as #lines?arm=current&is_success=true lists them.
+// Result rows: a link such as #rows?condition=current&is_success=true lists them.
 
-const { files, rows } = JSON.parse(document.getElementById("lines-data").textContent);
-const lines = rows.map(([file, number, arm, trainSeed, seed, isSuccess, isStrict, time, failure, offset, force, clip]) =>
-  ({ file, number, arm, trainSeed, seed, isSuccess, isStrict, time, failure, offset, force, clip }));
-const dialog = document.getElementById("lines");
+const data = JSON.parse(document.getElementById("rows-data").textContent);
+const rows = data.rows.map(([file, number, condition, trainSeed, seed, isSuccess, isStrict, time, failure, clip, ...columns]) =>
+  ({ file: data.files[file], number, condition, trainSeed, seed, isSuccess, isStrict, time, failure, clip, columns }));
+const dialog = document.getElementById("rows");
+
+// Parameter of a link -> property of a row.
+const properties = { is_success: "isSuccess", is_strict: "isStrict", failure: "failure", train_seed: "trainSeed" };
+
+function otherConditions(query) {
+  return (query.get("versus") ?? "").split(",").filter(Boolean).map(decodeURIComponent);
+}
 
 function select(query) {
-  const arm = query.get("arm");
-  const versus = (query.get("versus") ?? "").split(",").filter(Boolean).map(decodeURIComponent);
-  const arms = [arm, ...versus];
-  const wanted = { isSuccess: query.get("is_success"), isStrict: query.get("is_strict") };
-  let found = lines.filter((line) => arms.includes(line.arm));
-  for (const [name, value] of Object.entries(wanted)) {
-    if (value !== null) found = found.filter((line) => String(line[name]) === value);
-  }
-  for (const [name, value] of [["failure", query.get("failure")], ["trainSeed", query.get("train_seed")]]) {
-    if (value !== null) found = found.filter((line) => String(line[name]) === value);
+  const conditions = [query.get("condition"), ...otherConditions(query)];
+  let found = rows.filter((row) => conditions.includes(row.condition));
+  for (const [parameter, property] of Object.entries(properties)) {
+    const value = query.get(parameter);
+    if (value !== null) found = found.filter((row) => String(row[property]) === value);
   }
   if (query.has("within")) {
-    found = found.filter((line) => line.isSuccess && line.time <= Number(query.get("within")));
+    found = found.filter((row) => row.isSuccess && row.time <= Number(query.get("within")));
   }
-  if (versus.length) {
+  if (conditions.length > 1) {
     const episodes = new Map();
-    for (const line of found) {
-      const key = `${line.trainSeed} ${line.seed}`;
-      episodes.set(key, [...(episodes.get(key) ?? []), line]);
+    for (const row of found) {
+      const key = `${row.trainSeed} ${row.seed}`;
+      episodes.set(key, [...(episodes.get(key) ?? []), row]);
     }
     const differ = query.get("is_different") === "true";
-    found = [...episodes.values()].filter((episode) => episode.length === arms.length
-      && (!differ || new Set(episode.map((line) => line.isSuccess)).size > 1)).flat();
+    found = [...episodes.values()].filter((episode) => episode.length === conditions.length
+      && (!differ || new Set(episode.map((row) => row.isSuccess)).size > 1)).flat();
     found.sort((a, b) => (a.trainSeed ?? -1) - (b.trainSeed ?? -1) || a.seed - b.seed
-      || arms.indexOf(a.arm) - arms.indexOf(b.arm));
+      || conditions.indexOf(a.condition) - conditions.indexOf(b.condition));
   }
   return found;
 }
 
 function describe(query, count) {
-  const parts = [query.get("arm")];
-  if (query.has("versus")) parts[0] += ` and ${query.get("versus").split(",").map(decodeURIComponent).join(", ")}, common seeds`;
+  const parts = [query.get("condition")];
+  if (query.has("versus")) parts[0] += ` and ${otherConditions(query).join(", ")}, common seeds`;
   if (query.get("is_different") === "true") parts.push("outcomes that differ");
   if (query.has("is_success")) parts.push(query.get("is_success") === "true" ? "successes" : "failures");
   if (query.has("is_strict")) parts.push("strict successes");
   if (query.has("within")) parts.push(`successes within ${Number(query.get("within"))} s`);
   if (query.has("failure")) parts.push(query.get("failure").replaceAll("_", " "));
   if (query.has("train_seed")) parts.push(`training seed ${query.get("train_seed")}`);
-  return `${parts.join(", ")}: ${count} line${count === 1 ? "" : "s"}`;
+  return `${parts.join(", ")}: ${count} row${count === 1 ? "" : "s"}`;
 }
 
-function rowOf(line) {
-  const file = files[line.file];
+function tableRow(row) {
   const link = document.createElement("a");
-  link.href = `${file.split("/").map(encodeURIComponent).join("/")}#L${line.number}`;
-  link.textContent = `${file}:${line.number}`;
-  const row = document.createElement("tr");
+  link.href = `${row.file.split("/").map(encodeURIComponent).join("/")}#L${row.number}`;
+  link.textContent = `${row.file}:${row.number}`;
+  const made = document.createElement("tr");
   const cell = (content, sort = content, isText = false) => {
-    const made = row.insertCell();
-    made.append(content ?? "–");
-    made.dataset.sort = sort ?? "";
-    if (isText) made.className = "text";
+    const cell = made.insertCell();
+    cell.append(content ?? "–");
+    cell.dataset.sort = sort ?? "";
+    if (isText) cell.className = "text";
   };
-  cell(link, line.number, true);
-  cell(line.arm, line.arm, true);
-  cell(line.trainSeed);
-  cell(line.seed);
-  cell(line.failure.replaceAll("_", " ") || "success", line.failure, true);
-  cell(line.isStrict ? "yes" : "no", Number(line.isStrict), true);
-  cell(line.time?.toFixed(2), line.time);
-  cell(line.offset?.map((part) => part.toFixed(1)).join(", "), line.offset && Math.hypot(...line.offset));
-  cell(line.force.toFixed(1), line.force);
-  cell(line.clip, line.clip, true);
-  return row;
+  cell(link, row.number, true);
+  cell(row.condition, row.condition, true);
+  cell(row.trainSeed);
+  cell(row.seed);
+  cell(row.failure.replaceAll("_", " ") || "success", row.failure, true);
+  cell(row.isStrict ? "yes" : "no", Number(row.isStrict), true);
+  cell(row.time?.toFixed(2), row.time);
+  for (const value of row.columns) { // a number, a vector, or null
+    const isVector = Array.isArray(value);
+    const text = isVector ? value.map((part) => part.toFixed(1)).join(", ") : value?.toFixed(1);
+    cell(text, isVector ? Math.hypot(...value) : value);
+  }
+  cell(row.clip, row.clip, true);
+  return made;
 }
 
-function showLines() {
+function showRows() {
   const [name, query] = location.hash.split(/\?(.*)/s);
-  if (name !== "#lines" || !query) {
+  if (name !== "#rows" || !query) {
     if (dialog.open) dialog.close();
     return;
   }
   const chosen = new URLSearchParams(query);
   const found = select(chosen);
-  document.getElementById("lines-title").textContent = describe(chosen, found.length);
+  document.getElementById("rows-title").textContent = describe(chosen, found.length);
   const table = dialog.querySelector("table");
   table.querySelectorAll("th[aria-sort]").forEach((head) => head.removeAttribute("aria-sort"));
-  table.tBodies[0].replaceChildren(...found.map(rowOf));
+  table.tBodies[0].replaceChildren(...found.map(tableRow));
   if (!dialog.open) dialog.showModal();
 }
 
 // Closing goes back in the page, not up to its top.
 dialog.addEventListener("close", () => {
-  if (location.hash.startsWith("#lines?")) history.replaceState(null, "", location.pathname + location.search);
+  if (location.hash.startsWith("#rows?")) history.replaceState(null, "", location.pathname + location.search);
 });
-document.getElementById("lines-close").addEventListener("click", () => dialog.close());
+document.getElementById("rows-close").addEventListener("click", () => dialog.close());
 dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
-window.addEventListener("hashchange", showLines);
-showLines();
+window.addEventListener("hashchange", showRows);
+showRows();

@@ -1,41 +1,47 @@
-"""The arms of a benchmark: what their names say, how a reader calls them, in which order."""
+"""Conditions of a benchmark as tables and figures name them: label, group and order."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
-PAPER_ERROR = "uniform"
-"""Error kind that is the paper's "with error": uniform within the bounds of its equations 6, 7."""
+from robo_manip_baselines.observation import (
+    ERRORS,
+    MAX_HORIZON,
+    PRESETS,
+    Corruption,
+    ObservationSpec,
+)
 
-PAPER_HORIZONS = range(1, 6)
-"""Frames of 1/30 s, Tables IV and V."""
+WITH_ERROR = "uniform"
+"""Error that labels call "with error": the paper's, uniform within its equations 6 and 7."""
 
-GROUPS = ("Baseline", "Current only", "Current + prediction", "Further arms")
-"""The paper's observation types (Table IV), then everything that the paper does not have."""
+GROUPS = ("Baseline", "Current only", "Current + prediction", "Further conditions")
+"""Observation presets without a corruption or with the paper's error, then everything else."""
 
 BASELINE, CURRENT, PREDICTION, FURTHER = GROUPS
 
-_NAME = re.compile(
-    r"(?P<obs>baseline|current_pred|current)(?:_h(?P<horizon>\d+))?"
-    r"(?:_(?P<error>uniform|gaussian|empirical|model))?(?:_delay(?P<delay>\d+))?"
-)
+MAX_DELAY = 30
+"""Frames of the latest condition that the rows of version 1 name."""
 
 
 @dataclass(frozen=True)
-class Arm:
-    """An experimental arm.
+class ConditionDescription:
+    """Name and place of an experimental condition in tables and figures.
 
     Attributes:
         name: as in ``results.jsonl``.
-        label: what a reader is shown.
+        label: for readers.
         group: one of ``GROUPS``.
-        horizon: frames of the forecast; 0 shows the present mouth only; None shows no mouth, or it
-            cannot be told.
-        error: kind of error in what the policy is shown; ``none`` without.
-        delay: frames by which all that the policy is told of the mouth is late.
+        horizon: frames of the forecast; 0 for the present position alone; None where the policy
+            is not shown the target, or the observation is not known.
+        error: error of the forecast; ``none`` without.
+        delay: frames by which the observed target is late.
+
+    Raises:
+        ValueError: there is no such group.
     """
 
     name: str
@@ -50,52 +56,86 @@ class Arm:
             raise ValueError(f"group '{self.group}': must be one of {', '.join(GROUPS)}")
 
 
-def arm_of(name: str) -> Arm:
-    """Describe an arm by its name, for example ``current_pred_h2_uniform``.
+def describe_condition(
+    name: str, spec: ObservationSpec | None = None, label: str = ""
+) -> ConditionDescription:
+    """Describe a condition by its observation spec.
 
-    A name of another form is an arm of the last group, called by its name.
-    """
-    found = _NAME.fullmatch(name)
-    if found is None or (found["obs"] == "current_pred") != (found["horizon"] is not None):
-        return Arm(name, name, FURTHER)
-    error, delay = found["error"] or "none", int(found["delay"] or 0)
-    horizon = {"baseline": None, "current": 0}.get(found["obs"], int(found["horizon"] or 0))
-    group = {"baseline": BASELINE, "current": CURRENT}.get(found["obs"], PREDICTION)
-    label = group
-    if group == PREDICTION:
-        label = f"Prediction, {horizon} frame{'s' if horizon != 1 else ''}"
-    if error != "none":
-        label += ", with error" if error == PAPER_ERROR else f", {error} error"
-    if delay:
-        label += f", {delay} frame{'s' if delay != 1 else ''} late"
-    is_paper = not delay and (
-        error == "none" if group != PREDICTION else error in ("none", PAPER_ERROR)
-    )
-    return Arm(name, label, group if is_paper else FURTHER, horizon, error, delay)
-
-
-def in_order(names: Iterable[str], described: Mapping[str, Arm] | None = None) -> tuple[Arm, ...]:
-    """Describe arms and put them in the order of the paper's table, further arms last.
-
-    Within the forecasts: by horizon, without error before with error. Within the further arms: as
-    they are described, then by horizon, error, delay and name.
+    A condition with another name than its preset, error and delay make differs in something else
+    too: it belongs to the last group, labelled with its name.
 
     Args:
-        names: of arms, in any order, repeated or not.
-        described: arms whose names do not say enough; may name others too.
+        name: of the condition.
+        spec: of what its policy is shown; None, as in rows of version 1, looks the name up.
+        label: for readers; made from the spec if empty.
     """
-    described = described or {}
-    given = {name: place for place, name in enumerate(described)}
+    spec = spec or _specs_by_name().get(name)
+    if spec is None:
+        return ConditionDescription(name, label or name, FURTHER)
+    error, delay = spec.corruption.error, spec.corruption.delay
+    if _spec_with(spec.obs, spec.horizon, error, delay).name != name:
+        return ConditionDescription(name, label or name, FURTHER)
+    group = GROUPS[PRESETS.index(spec.obs)]
+    horizon = spec.frames - 1 if spec.frames else None
+    made = f"Prediction, {_frames(spec.horizon)}" if group == PREDICTION else group
+    if error != "none":
+        made += ", with error" if error == WITH_ERROR else f", {error} error"
+    if delay:
+        made += f", {_frames(delay)} late"
+    if delay or error not in ("none", WITH_ERROR):
+        group = FURTHER
+    return ConditionDescription(name, label or made, group, horizon, error, delay)
 
-    def place(arm: Arm) -> tuple[int, int, float, bool, str, int, str]:
+
+def sort_conditions(
+    conditions: Iterable[ConditionDescription], given: Sequence[str] = ()
+) -> list[ConditionDescription]:
+    """Sort conditions as the paper's table does, further ones last.
+
+    Predictions are sorted by horizon, without error before with error; further conditions by their
+    order in ``given``, then by horizon, error, delay and name.
+
+    Args:
+        conditions: in any order.
+        given: names in the order of whoever declared them.
+    """
+
+    def place(
+        condition: ConditionDescription,
+    ) -> tuple[int, int, float, bool, str, int, str]:
+        is_declared = condition.group == FURTHER and condition.name in given
         return (
-            GROUPS.index(arm.group),
-            given.get(arm.name, len(given)) if arm.group == FURTHER else 0,
-            math.inf if arm.horizon is None else arm.horizon,
-            arm.error != "none",
-            arm.error,
-            arm.delay,
-            arm.name,
+            GROUPS.index(condition.group),
+            given.index(condition.name) if is_declared else len(given),
+            math.inf if condition.horizon is None else condition.horizon,
+            condition.error != "none",
+            condition.error,
+            condition.delay,
+            condition.name,
         )
 
-    return tuple(sorted((described.get(name) or arm_of(name) for name in set(names)), key=place))
+    return sorted(conditions, key=place)
+
+
+@cache
+def _specs_by_name() -> dict[str, ObservationSpec]:
+    delays = range(MAX_DELAY + 1)
+    specs = [
+        ObservationSpec("baseline"),
+        *(_spec_with("current", 1, "none", delay) for delay in delays),
+        *(
+            _spec_with("current_pred", horizon, error, delay)
+            for horizon in range(1, MAX_HORIZON + 1)
+            for error in ERRORS
+            for delay in delays
+        ),
+    ]
+    return {spec.name: spec for spec in specs}
+
+
+def _spec_with(obs: str, horizon: int, error: str, delay: int) -> ObservationSpec:
+    return ObservationSpec(obs, horizon, corruption=Corruption(error=error, delay=delay))
+
+
+def _frames(number: int) -> str:
+    return f"{number} frame{'s' if number != 1 else ''}"

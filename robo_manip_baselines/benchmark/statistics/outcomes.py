@@ -1,4 +1,7 @@
-"""Result lines and where they stand, so that every figure can be traced to them."""
+"""Result rows with their place in a file, and the outcomes of a condition as a matrix.
+
+Legend: C conditions, R training seeds, E evaluation seeds.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import APPROACH_LIMIT
-from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.rollout.results import EpisodeResult, read_rows
 from robo_manip_baselines.runs.errors import RequestError
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line of a results file.
+class ResultRow:
+    """Row of a results file and its place.
 
     Attributes:
-        file: path of the file, with forward slashes, as a link from the report spells it.
-        number: of the line, from 1.
-        result: what it says.
+        file: path of the file, with forward slashes, as a link from the report has it.
+        number: of the row, from 1.
+        result: of the episode.
     """
 
     file: str
@@ -31,22 +35,22 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Selection:
-    """Which result lines a figure comes from. ``None`` selects everything.
+class RowSelection:
+    """Result rows that a number is computed from. ``None`` selects everything.
 
     Attributes:
-        arm: name of the arm.
+        condition: name of the condition.
         train_seed: of the policy.
         is_success: only successes, or only failures.
         is_strict: only strict successes.
-        within: only successes within so many s of the lift.
+        within: only successes with at most this completion time, s.
         failure: only this kind of failure.
-        versus: names of other arms; then the lines of all are meant, for training and evaluation
-            seeds that all of them have, and that all of them managed where ``is_success``.
-        is_different: with ``versus``: only seeds that one arm managed and another did not.
+        versus: names of other conditions. The rows of all of them are selected then, for training
+            and evaluation seeds that all have (and, with ``is_success``, at which all succeeded).
+        is_different: with ``versus``: only seeds at which some succeeded and others failed.
     """
 
-    arm: str
+    condition: str
     train_seed: int | None = None
     is_success: bool | None = None
     is_strict: bool | None = None
@@ -56,70 +60,48 @@ class Selection:
     is_different: bool = False
 
 
-def read_lines(files: Iterable[Path], root: Path | None = None) -> tuple[Line, ...]:
-    """Read results files of any number of arms; a torn last line is left out.
+def read_result_rows(files: Iterable[Path], root: Path | None = None) -> tuple[ResultRow, ...]:
+    """Read results files of any number of conditions; a torn last row is left out.
 
     Args:
         files: paths of ``results.jsonl`` files.
-        root: folder that the paths are told relative to, usually that of the report.
+        root: folder that the paths of the rows are relative to, usually that of the report.
 
     Raises:
         RequestError: a file is missing or damaged, holds results of another environment, or an
-            episode (arm, training seed, seed) is there twice.
+            episode (condition, training seed, seed) is there twice.
     """
-    lines: list[Line] = []
-    seen: dict[tuple[str, int | None, int], Line] = {}
+    seen: dict[tuple[str, int | None, int], ResultRow] = {}
     for path in files:
-        try:
-            text = path.read_text(encoding="utf-8", errors="replace")
-        except OSError as error:
-            raise RequestError(
-                f"'{path}' cannot be read: {error.strerror}; name a results.jsonl file"
-            ) from error
-        name = _relative(path, root)
-        for number, content in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
-            try:
-                line = Line(name, number, EpisodeResult.from_line(content))
-            except ValueError as error:
-                raise RequestError(
-                    f"'{path}', line {number} is damaged: {error}; remove that line"
-                ) from error
-            key = (line.result.arm, line.result.train_seed, line.result.seed)
+        name = path if root is None else os.path.relpath(path.resolve(), root.resolve())
+        for number, result in enumerate(read_rows(path), start=1):
+            row = ResultRow(Path(name).as_posix(), number, result)
+            key = (result.condition, result.train_seed, result.seed)
             if there := seen.get(key):
                 raise RequestError(
-                    f"'{path}', line {number}: arm {key[0]}, training seed {key[1]}, seed {key[2]} "
-                    f"is also in '{there.file}', line {there.number}; give one of them only"
+                    f"'{path}', line {number}: condition {key[0]}, training seed {key[1]}, seed "
+                    f"{key[2]} is also in '{there.file}', line {there.number}; give one of them "
+                    "only"
                 )
-            seen[key] = line
-            lines.append(line)
-    environments = sorted({line.result.env for line in lines})
+            seen[key] = row
+    environments = sorted({row.result.env for row in seen.values()})
     if len(environments) > 1:
         raise RequestError(
             f"results of {' and '.join(environments)} do not compare; give those of one environment"
         )
-    return tuple(lines)
-
-
-def _relative(path: Path, root: Path | None) -> str:
-    """Return a path as a link from a folder would spell it, or as it is."""
-    if root is None:
-        return path.as_posix()
-    return Path(os.path.relpath(path.resolve(), root.resolve())).as_posix()
-
-
-Floats = NDArray[np.float64]
+    return tuple(seen.values())
 
 
 @dataclass(frozen=True, eq=False)
-class Outcomes:
-    """What the episodes of one arm came to.
+class OutcomeMatrix:
+    """Outcomes of the episodes of one condition; NaN where there is no episode.
 
     Attributes:
         train_seeds: R of them, None for a policy that was not trained.
         seeds: E of them, in ascending order.
         success: (R, E) 1 or 0.
         strict: (R, E) likewise, of ``is_success_strict``.
-        time: (R, E) s, from the lift to success.
+        time: (R, E) s, completion times; NaN without success, too.
     """
 
     train_seeds: tuple[int | None, ...]
@@ -129,57 +111,67 @@ class Outcomes:
     time: Floats
 
     @property
-    def in_time(self) -> Floats:
-        """(R, E) 1 or 0: success within the time that the paper's Algorithm 1 gives."""
-        is_in_time = np.nan_to_num(self.time, nan=np.inf) <= APPROACH_LIMIT
-        return np.where(np.isfinite(self.success), is_in_time, np.nan)
-
-    @property
     def episodes(self) -> int:
-        """How many there are."""
+        """Number of episodes."""
         return int(np.isfinite(self.success).sum())
 
+    @property
+    def complete_seeds(self) -> set[int]:
+        """Evaluation seeds that every training seed has."""
+        is_complete = np.isfinite(self.success).all(axis=0)
+        return {seed for seed, complete in zip(self.seeds, is_complete, strict=True) if complete}
 
-def outcomes_of(lines: Sequence[Line]) -> Outcomes:
-    """Arrange the result lines of one arm."""
-    results = [line.result for line in lines]
-    train_seeds = tuple(sorted({r.train_seed for r in results}, key=lambda s: (s is not None, s)))
+    def success_within(self, limit: float) -> Floats:
+        """Return (R, E) 1 or 0: success with a completion time of at most ``limit`` s."""
+        is_within = np.nan_to_num(self.time, nan=np.inf) <= limit
+        return np.where(np.isfinite(self.success), is_within, np.nan)
+
+
+def outcome_matrix(rows: Sequence[ResultRow]) -> OutcomeMatrix:
+    """Arrange the result rows of one condition by training and evaluation seed."""
+    results = [row.result for row in rows]
+    train_seeds = sorted_train_seeds(r.train_seed for r in results)
     seeds = tuple(sorted({r.seed for r in results}))
-    rows = {seed: row for row, seed in enumerate(train_seeds)}
-    columns = {seed: column for column, seed in enumerate(seeds)}
 
-    def grid(value: Callable[[EpisodeResult], float | None]) -> Floats:
-        cells = np.full((len(train_seeds), len(seeds)), np.nan)
+    def matrix(value: Callable[[EpisodeResult], float | None]) -> Floats:
+        values = np.full((len(train_seeds), len(seeds)), np.nan)
         for r in results:
-            if (number := value(r)) is not None:
-                cells[rows[r.train_seed], columns[r.seed]] = number
-        return cells
+            values[row_of[r.train_seed], column_of[r.seed]] = value(r)  # None becomes NaN
+        return values
 
-    return Outcomes(
+    row_of = {seed: row for row, seed in enumerate(train_seeds)}
+    column_of = {seed: column for column, seed in enumerate(seeds)}
+    return OutcomeMatrix(
         train_seeds,
         seeds,
-        success=grid(lambda r: r.is_success),
-        strict=grid(lambda r: r.is_success_strict),
-        time=grid(lambda r: r.completion_time if r.is_success else None),
+        success=matrix(lambda r: r.is_success),
+        strict=matrix(lambda r: r.is_success_strict),
+        time=matrix(lambda r: r.completion_time if r.is_success else None),
     )
 
 
-def on_common_seeds(arms: Sequence[Outcomes], measure: str) -> Floats:
-    """Return one grid of several arms, where all of them have it.
+def sorted_train_seeds(seeds: Iterable[int | None]) -> tuple[int | None, ...]:
+    """Sort training seeds without repetitions, None first."""
+    return tuple(sorted(set(seeds), key=lambda seed: (seed is not None, seed)))
+
+
+def on_common_seeds(outcomes: Sequence[OutcomeMatrix], measure: str) -> Floats:
+    """Return one measure of several conditions on the seeds that all of them have.
 
     Args:
-        arms: A of them.
+        outcomes: of C conditions.
         measure: ``success``, ``strict`` or ``time``.
 
     Returns:
-        (A, R', E') over the training and evaluation seeds that all arms have; either may be 0. A
-        cell that is NaN in one arm is NaN in all.
+        (C, R', E') over the common training and evaluation seeds; either may be 0. An element that
+        is NaN in one condition is NaN in all.
     """
-    rows = [seed for seed in arms[0].train_seeds if all(seed in arm.train_seeds for arm in arms)]
-    columns = [seed for seed in arms[0].seeds if all(seed in arm.seeds for arm in arms)]
-    grids = np.empty((len(arms), len(rows), len(columns)))
-    for grid, arm in zip(grids, arms, strict=True):
-        own_rows = [arm.train_seeds.index(seed) for seed in rows]
-        own_columns = [arm.seeds.index(seed) for seed in columns]
-        grid[:] = getattr(arm, measure)[np.ix_(own_rows, own_columns)]
-    return np.where(np.isfinite(grids).all(axis=0), grids, np.nan)
+    first = outcomes[0]
+    rows = [s for s in first.train_seeds if all(s in other.train_seeds for other in outcomes)]
+    columns = [s for s in first.seeds if all(s in other.seeds for other in outcomes)]
+    matrices = np.empty((len(outcomes), len(rows), len(columns)))
+    for matrix, own in zip(matrices, outcomes, strict=True):
+        own_rows = [own.train_seeds.index(seed) for seed in rows]
+        own_columns = [own.seeds.index(seed) for seed in columns]
+        matrix[:] = getattr(own, measure)[np.ix_(own_rows, own_columns)]
+    return np.where(np.isfinite(matrices).all(axis=0), matrices, np.nan)

@@ -1,4 +1,4 @@
-"""A table once, written as Markdown, CSV or LaTeX; the report writes it as HTML."""
+"""Tables, and their files as Markdown, CSV and LaTeX; the report writes them as HTML."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import csv
 import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from robo_manip_baselines.benchmark.statistics.outcomes import Selection
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.benchmark.statistics.outcomes import RowSelection
+from robo_manip_baselines.runs.files import write_text
 
 Value = str | int | float | bool | None
 
 NOTHING = "–"
-"""stands where there is no figure."""
+"""Text of a cell without a value."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column.
+    """Column of a table.
 
     Attributes:
-        title: what a reader is shown.
+        title: its heading.
         names: of the values of a cell, each a column of the CSV.
-        is_text: whether cells hold words, not figures.
+        is_text: whether cells hold words, not numbers.
     """
 
     title: str
@@ -36,24 +36,24 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """What stands in a row and a column.
+    """Cell of a table.
 
     Attributes:
-        text: what a reader is shown.
+        text: for readers.
         values: the same for machines, one for each name of the column. The first one sorts.
-        selection: result lines that it comes from; None for what does not come from any.
+        selection: result rows that it is computed from; None if from none.
         is_strong: whether it is set in bold, as the best of a column.
     """
 
     text: str
     values: tuple[Value, ...]
-    selection: Selection | None = None
+    selection: RowSelection | None = None
     is_strong: bool = False
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row; rows of the same group stand together."""
+    """Row of a table; rows of the same group are neighbours."""
 
     group: str
     cells: tuple[Cell, ...]
@@ -61,7 +61,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """Table with a title and notes.
 
     Attributes:
         name: of its files, without ending.
@@ -94,10 +94,7 @@ def to_markdown(table: Table) -> str:
 
     head = [_markdown(column.title) for column in table.columns]
     rules = ["---" if column.is_text else "--:" for column in table.columns]
-    body = [
-        [f"**{_markdown(cell.text)}**" if cell.is_strong else _markdown(cell.text) for cell in row]
-        for row in (row.cells for row in table.rows)
-    ]
+    body = [_texts(row, _markdown, "**{}**") for row in table.rows]
     lines = [f"**{_markdown(table.title)}**", "", line(head), line(rules), *map(line, body)]
     if table.notes:
         lines += ["", " ".join(map(_markdown, table.notes))]
@@ -130,30 +127,29 @@ def to_latex(table: Table) -> str:
     for number, row in enumerate(table.rows):
         if number and groups[number - 1] != row.group:
             lines.append(r"\addlinespace")
-        cells = [
-            rf"\textbf{{{_latex(cell.text)}}}" if cell.is_strong else _latex(cell.text)
-            for cell in row.cells
-        ]
-        lines.append(" & ".join(cells) + r" \\")
+        lines.append(" & ".join(_texts(row, _latex, r"\textbf{{{}}}")) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
     lines += [f"% {note}" for note in table.notes]
     return "\n".join(lines) + "\n"
 
 
 FORMATS = {"md": to_markdown, "csv": to_csv, "tex": to_latex}
-"""Ending of the file -> how its content is made."""
+"""Extension of a file -> function that makes its content."""
 
 
 def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
     """Write every table in every format, for example ``success.md``; return the paths."""
     paths = []
     for table in tables:
-        for ending, written in FORMATS.items():
-            path = folder / f"{table.name}.{ending}"
-            with atomic_file(path) as temporary:
-                temporary.write_text(written(table), encoding="utf-8")
-            paths.append(path)
+        for extension, content in FORMATS.items():
+            paths.append(folder / f"{table.name}.{extension}")
+            write_text(paths[-1], content(table))
     return paths
+
+
+def _texts(row: Row, escape: Callable[[str], str], strong: str) -> list[str]:
+    """Return the escaped texts of a row's cells, those in bold within ``strong``."""
+    return [strong.format(escape(c.text)) if c.is_strong else escape(c.text) for c in row.cells]
 
 
 def _csv(value: Value) -> str:

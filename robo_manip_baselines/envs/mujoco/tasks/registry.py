@@ -89,6 +89,7 @@ class ResultColumn:
         description: for the documentation.
         is_optional: whether null is valid.
         in_report: whether the report lists it with each episode.
+        unit: SI unit, for the heading in the report.
     """
 
     name: str
@@ -96,6 +97,7 @@ class ResultColumn:
     description: str
     is_optional: bool = False
     in_report: bool = False
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,7 @@ class TaskEntry:
         attributes: likewise.
         columns: that it adds to result rows.
         success, strict_success: descriptions of the two conditions.
+        completion_time: description of the interval that ``completion_time`` measures.
         success_time_limit: s after which a success counts as late in tables; None for no limit.
         study: ``module:name`` of its `TaskStudy`; empty without one.
         schema_version: lowest version of the episode schema that describes its files.
@@ -242,6 +245,7 @@ class TaskEntry:
     columns: tuple[ResultColumn, ...] = ()
     success: str = ""
     strict_success: str = ""
+    completion_time: str = "from the start to success"
     success_time_limit: float | None = None
     study: str = ""
     schema_version: int = 3

@@ -77,6 +77,7 @@ ENTRY = TaskEntry(
             "units of the tolerances; null without a lift",
             is_optional=True,
             in_report=True,
+            unit="m",
         ),
         ResultColumn(
             "cube_offset",
@@ -86,11 +87,16 @@ ENTRY = TaskEntry(
             is_optional=True,
         ),
         ResultColumn(
-            "face_force", "float", "N, largest normal force between robot and face", in_report=True
+            "face_force",
+            "float",
+            "N, largest normal force between robot and face",
+            in_report=True,
+            unit="N",
         ),
     ),
     success="the gripper brought the cube within 0.03, 0.01 and 0.01 m of the mouth",
     strict_success="the cube let go inside the mouth, the face never touched",
+    completion_time="from the lift to success",
     success_time_limit=APPROACH_LIMIT,
     study=f"{_PACKAGE}.paper:STUDY",
     schema_version=1,

@@ -1,4 +1,4 @@
-"""Made-up result lines of a whole benchmark: sixteen arms, two training seeds, 100 episodes."""
+"""Made-up result rows of a whole benchmark: sixteen conditions, two training seeds, 100 episodes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robo_manip_baselines.benchmark.statistics.outcomes import Line, read_lines
-from robo_manip_baselines.benchmark.statistics.study import Study, analyse
-from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import failure_kind
+from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, read_result_rows
+from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
+from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import failure_kind
 from robo_manip_baselines.rollout.results import EpisodeResult
 
-ARMS = {
+CONDITIONS = {
     "baseline": 0.42,
     "current": 0.60,
     **{f"current_pred_h{h}": p for h, p in enumerate((0.66, 0.74, 0.72, 0.68, 0.60), start=1)},
@@ -27,18 +28,18 @@ ARMS = {
 }
 """Name -> chance of success."""
 
-MakeLines = Callable[..., tuple[Line, ...]]
+MakeRows = Callable[..., tuple[ResultRow, ...]]
 
 
 def make_results(
-    arms: Sequence[str] = tuple(ARMS), train_seeds: int = 2, episodes: int = 100, seed: int = 0
+    conditions: Sequence[str] = tuple(CONDITIONS), train_seeds: int = 2, episodes: int = 100, seed: int = 0
 ) -> list[EpisodeResult]:
-    """Draw results; easy seeds are easy for all arms, and training runs differ."""
+    """Draw results; easy seeds are easy for all conditions, and training runs differ."""
     rng = np.random.default_rng(seed)
     ease = rng.normal(0.0, 1.0, episodes)
     results = []
-    for arm in arms:
-        chance = ARMS[arm]
+    for condition in conditions:
+        chance = CONDITIONS[condition]
         for train_seed in range(train_seeds):
             luck = rng.normal(0.0, 0.3)
             for episode in range(episodes):
@@ -65,21 +66,23 @@ def make_results(
                         is_success=is_success,
                         is_success_strict=is_success and bool(rng.random() < 0.5),
                         completion_time=round(time, 6) if is_success else None,
-                        time_since_lift=8.0 if was_grasped else None,
                         steps=600,
                         failure=failure_kind(
                             is_success=is_success,
                             was_released=bool(rng.random() < 0.3),
                             closest_offset=offset,
                         ),
-                        closest_distance=float(np.linalg.norm(offset)) if offset else None,
-                        closest_offset=offset,
-                        cube_offset=offset and (offset[0] - 0.012, *offset[1:]),
-                        face_force=0.0,
                         motion_clip=f"clip_{episode % 7}",
                         motion_subject=f"person {episode % 5}",
+                        columns={
+                            "time_since_lift": 8.0 if was_grasped else None,
+                            "closest_distance": float(np.linalg.norm(offset)) if offset else None,
+                            "closest_offset": offset,
+                            "cube_offset": offset and (offset[0] - 0.012, *offset[1:]),
+                            "face_force": 0.0,
+                        },
                         policy="Act",
-                        arm=arm,
+                        condition=condition,
                         train_seed=train_seed,
                         checkpoint="ab" * 32,
                         versions={"numpy": "2"},
@@ -89,31 +92,31 @@ def make_results(
 
 
 def write_results(path: Path, results: Sequence[EpisodeResult]) -> Path:
-    """Write lines as an evaluation does."""
+    """Write rows as an evaluation does."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(f"{result.to_line()}\n" for result in results), encoding="utf-8")
     return path
 
 
 @pytest.fixture(scope="session")
-def make_lines(tmp_path_factory: pytest.TempPathFactory) -> MakeLines:
+def make_rows(tmp_path_factory: pytest.TempPathFactory) -> MakeRows:
     """Draw results, see ``make_results``, write them to a file and read them."""
 
-    def make(**changes: object) -> tuple[Line, ...]:
+    def make(**changes: object) -> tuple[ResultRow, ...]:
         folder = tmp_path_factory.mktemp("results")
         path = write_results(folder / "results.jsonl", make_results(**changes))  # type: ignore[arg-type]
-        return read_lines([path], root=folder)
+        return read_result_rows([path], root=folder)
 
     return make
 
 
 @pytest.fixture(scope="session")
-def lines(make_lines: MakeLines) -> tuple[Line, ...]:
+def rows(make_rows: MakeRows) -> tuple[ResultRow, ...]:
     """The whole benchmark."""
-    return make_lines()
+    return make_rows()
 
 
 @pytest.fixture(scope="session")
-def study(lines: tuple[Line, ...]) -> Study:
+def statistics(rows: tuple[ResultRow, ...]) -> BenchmarkStatistics:
     """Figures of the whole benchmark, with few resamples."""
-    return analyse(lines, resamples=500)
+    return analyze(rows, task=TASK, resamples=500)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,23 +11,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robo_manip_baselines.benchmark.statistics.comparison import (
-    against_paper,
-    holm,
-    paired_success,
-    paired_times,
-    time_against_paper,
-)
-from robo_manip_baselines.benchmark.statistics.intervals import (
+from robo_manip_baselines.benchmark.statistics.inference import (
+    NO_COMPARISON,
+    Comparison,
     Estimate,
     bootstrap_mean,
     hierarchical_mean,
     hierarchical_means,
+    holm,
     mean_estimate,
+    paired_success,
+    paired_times,
+    published_success,
+    published_time,
     rate_estimate,
 )
-from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER, TRIALS, PaperResult
-from robo_manip_baselines.rollout.results import share
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import STUDY
+from robo_manip_baselines.envs.mujoco.tasks.registry import PublishedResult
+from robo_manip_baselines.rollout.results import Proportion
 
 NAN = np.nan
 
@@ -142,7 +144,7 @@ def test_an_interval_lies_among_the_values(grid: np.ndarray) -> None:
 
 def test_rates() -> None:
     one = np.array([[1.0] * 37 + [0.0] * 13])
-    assert rate_estimate(one, rng()) == share(37, 50)
+    assert rate_estimate(one, rng()) == Proportion.of(37, 50)
     z2 = 1.959963984540054**2
     # Wilson for 0 of n ends at z²/(n + z²).
     assert rate_estimate(0 * one, rng()).high == pytest.approx(z2 / (50 + z2))
@@ -190,7 +192,7 @@ def test_interval_of_a_difference_is_that_of_pairs() -> None:
     assert d.high == pytest.approx(0.18 + 1.96 * error, abs=0.021)
 
 
-def test_arms_that_no_episode_tells_apart() -> None:
+def test_conditions_without_a_differing_episode() -> None:
     found = paired_success(*pairs(20, 0, 0, 30), rng(), 500)
     assert found.p == 1.0
     assert found.difference.mean == 0.0
@@ -202,7 +204,7 @@ def test_arms_that_no_episode_tells_apart() -> None:
 def test_no_pairs() -> None:
     nothing = np.full((1, 3), NAN)
     found = paired_success(nothing, nothing, rng())
-    assert (found.p, found.difference, found.wins) == (None, Estimate(None, None, None, 0), 0)
+    assert found == Comparison(Estimate(None, None, None, 0), None)
     assert paired_times(nothing, nothing, rng()).p is None
 
 
@@ -227,41 +229,43 @@ def test_wilcoxon_by_hand() -> None:
 
 
 def test_fishers_exact_test_sums_what_is_no_likelier() -> None:
-    paper = PAPER["baseline"]
-    total, hits = 60 + TRIALS, 40 + paper.successes
+    paper = STUDY.published["baseline"]
+    total, hits = 60 + STUDY.trials, 40 + paper.successes
     chance = [
-        math.comb(60, k) * math.comb(TRIALS, hits - k) / math.comb(total, hits)
-        for k in range(max(0, hits - TRIALS), min(60, hits) + 1)
+        math.comb(60, k) * math.comb(STUDY.trials, hits - k) / math.comb(total, hits)
+        for k in range(max(0, hits - STUDY.trials), min(60, hits) + 1)
     ]
-    seen = chance[40 - max(0, hits - TRIALS)]
-    found = against_paper(40, 60, paper)
+    seen = chance[40 - max(0, hits - STUDY.trials)]
+    found = published_success(Proportion.of(40, 60), 60, paper, STUDY.trials)
     assert found.p == pytest.approx(sum(p for p in chance if p <= seen * (1 + 1e-9)))
     assert found.difference.mean == pytest.approx(40 / 60 - 0.42)
 
 
 @pytest.mark.parametrize(("count", "total"), [(40, 60), (0, 50), (200, 200)])
 def test_newcombes_interval_is_made_of_wilsons(count: int, total: int) -> None:
-    paper = PAPER["current"]
-    a, b = share(count, total), share(paper.successes, TRIALS)
+    paper = STUDY.published["current"]
+    a, b = Proportion.of(count, total), Proportion.of(paper.successes, STUDY.trials)
     assert None not in (a.rate, a.low, a.high, b.rate, b.low, b.high)
     d = a.rate - b.rate  # type: ignore[operator]
     low = d - math.hypot(a.rate - a.low, b.high - b.rate)  # type: ignore[operator]
     high = d + math.hypot(a.high - a.rate, b.rate - b.low)  # type: ignore[operator]
-    found = against_paper(count, total, paper).difference
+    found = published_success(Proportion.of(count, total), total, paper, STUDY.trials).difference
     assert (found.low, found.high) == pytest.approx((low, high))
 
 
 def test_nothing_beside_the_paper() -> None:
-    assert against_paper(0, 0, PAPER["current"]).p is None
-    assert time_against_paper(np.array([NAN]), PAPER["current"]).p is None
-    once = time_against_paper(np.array([4.0]), PAPER["current"])
+    assert published_success(Proportion.of(1, 2), 2, None, 0) == NO_COMPARISON
+    assert published_time(np.array([4.0]), None, 0.0) == NO_COMPARISON
+    assert published_success(Proportion.of(0, 0), 0, STUDY.published["current"], STUDY.trials).p is None
+    assert published_time(np.array([NAN]), STUDY.published["current"], STUDY.time_rounding).p is None
+    once = published_time(np.array([4.0]), STUDY.published["current"], STUDY.time_rounding)
     assert (once.difference.mean, once.p) == (pytest.approx(-0.6), None)
 
 
 def test_times_beside_the_paper() -> None:
     times = np.array([4.0, 4.4, 4.8, NAN])  # mean 4.4, standard deviation 0.4
-    paper = PaperResult(successes=3, completion_time=5.05)
-    found = time_against_paper(times, paper)
+    paper = PublishedResult(successes=3, completion_time=5.05)
+    found = published_time(times, paper, STUDY.time_rounding)
     error = 0.4 * math.sqrt(2 / 3)
     # t with 4 degrees of freedom: two-sided tail (1 - x)/1, x = t (t² + 6) / (t² + 4)^1.5.
     t = (0.65 - 0.05) / error
@@ -271,14 +275,18 @@ def test_times_beside_the_paper() -> None:
     assert (found.difference.low, found.difference.high) == pytest.approx(
         (-0.65 - half, -0.65 + half), abs=1e-5
     )
-    near = time_against_paper(times, PaperResult(3, 4.44))  # no farther than the rounding
+    near = published_time(times, PublishedResult(3, 4.44), STUDY.time_rounding)  # no farther than the rounding
     assert near.p == 1.0
+
+
+def corrected(*p_values: float | None) -> list[float | None]:
+    return [c.p_holm for c in holm([replace(NO_COMPARISON, p=p) for p in p_values])]
 
 
 def test_holm_by_hand() -> None:
     # Smallest first: 3 · 0.01, 2 · 0.03, 1 · 0.04, and never below the one before.
-    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
-    assert holm([None, 0.01, None, 0.6]) == [None, pytest.approx(0.02), None, pytest.approx(0.6)]
-    assert holm([0.9, 0.8]) == [1.0, 1.0]
-    assert holm([None]) == [None]
-    assert holm([]) == []
+    assert corrected(0.01, 0.04, 0.03) == pytest.approx([0.03, 0.06, 0.06])
+    assert corrected(None, 0.01, None, 0.6) == [None, pytest.approx(0.02), None, pytest.approx(0.6)]
+    assert corrected(0.9, 0.8) == [1.0, 1.0]
+    assert corrected(None) == [None]
+    assert corrected() == []

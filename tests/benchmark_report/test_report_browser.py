@@ -1,4 +1,4 @@
-"""The report in headless Chromium: it draws, sorts, plays, and every figure opens its lines.
+"""The report in headless Chromium: it draws, sorts, plays, and every number opens its rows.
 
 Needs Playwright and a Chromium that plays H.264, as Debian's does: ``apt-get install chromium``.
 ``RMB_CHROMIUM`` names another one.
@@ -16,16 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.benchmark.report.page import (
     episodes_to_show,
     link,
     read_video,
-    report_data,
+    make_report,
     write_report,
 )
-from robo_manip_baselines.benchmark.statistics.outcomes import Line
-from robo_manip_baselines.benchmark.statistics.study import Study, analyse
-from robo_manip_baselines.benchmark.tables.study import study_tables
+from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow
+from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.benchmark.tables.benchmark import benchmark_tables
 from robo_manip_baselines.rollout.videos import VideoWriter
 
 pytestmark = pytest.mark.long
@@ -60,22 +61,22 @@ def write_video(path: Path) -> Path:
 
 @dataclass
 class Opened:
-    """A page, the study in it, and what it complained about or asked for."""
+    """A page, the statistics in it, and what it complained about or asked for."""
 
     page: Any
-    study: Study
+    statistics: BenchmarkStatistics
     address: str
     messages: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
 
     def count(self, query: str) -> int:
-        """Open the lines of a link and count them."""
+        """Open the rows of a link and count them."""
         title, shown = self.page.evaluate(
             """async (hash) => {
                  const happens = (target, event) => new Promise((resolve) => {
                    target.addEventListener(event, resolve, { once: true });
                  });
-                 const dialog = document.getElementById("lines");
+                 const dialog = document.getElementById("rows");
                  const changed = happens(window, "hashchange");
                  location.hash = hash;
                  await changed;
@@ -90,27 +91,27 @@ class Opened:
                }""",
             query,
         )
-        assert title.endswith(f": {shown} line{'' if shown == 1 else 's'}")
+        assert title.endswith(f": {shown} row{'' if shown == 1 else 's'}")
         return shown
 
 
 @pytest.fixture(scope="module")
 def opened(
-    tmp_path_factory: pytest.TempPathFactory, make_lines: Callable[..., tuple[Line, ...]]
+    tmp_path_factory: pytest.TempPathFactory, make_rows: Callable[..., tuple[ResultRow, ...]]
 ) -> Iterator[Opened]:
     playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     executable = chromium()
     names = ("baseline", "current", "current_pred_h2", "current_pred_h2_uniform")
-    study = analyse(make_lines(arms=names, episodes=30), resamples=100)
+    statistics = analyze(make_rows(conditions=names, episodes=30), task=TASK, resamples=100)
     path = tmp_path_factory.mktemp("report") / "report.html"
     video = write_video(path.with_name("video.mp4"))
-    shown = [read_video(video, line) for line in episodes_to_show(study)]
-    write_report(path, report_data(study, title="Feeding", videos=shown))
+    shown = [read_video(video, row) for row in episodes_to_show(statistics)]
+    write_report(path, make_report(statistics, title="Feeding", videos=shown))
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=executable, args=list(FLAGS))
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.set_default_timeout(PATIENCE)
-        found = Opened(page, study, path.as_uri())
+        found = Opened(page, statistics, path.as_uri())
         page.on("console", lambda message: found.messages.append(message.text))
         page.on("pageerror", lambda error: found.messages.append(str(error)))
         page.on("request", lambda request: found.requests.append(request.url))
@@ -126,7 +127,7 @@ def test_it_draws_and_asks_for_nothing(opened: Opened) -> None:
     assert opened.messages == []
     assert {url for url in opened.requests if not url.startswith("data:")} == {opened.address}
     for name in ("success_by_horizon", "completion_times", "arrivals", "failures"):
-        box = page.locator(f"#plot-{name} svg").bounding_box()
+        box = page.locator(f"#figure-{name} svg").bounding_box()
         assert box["width"] > 300
         assert box["height"] > 100
     assert page.get_by_role("img", name="Success against the horizon").count() == 1
@@ -158,7 +159,7 @@ def test_ink_and_ground_follow_the_readers_colours(opened: Opened, scheme: str) 
     brightness = opened.page.evaluate(
         """() => [getComputedStyle(document.body).backgroundColor,
                   getComputedStyle(document.body).color,
-                  getComputedStyle(document.querySelector("#plot-failures svg text")).fill]
+                  getComputedStyle(document.querySelector("#figure-failures svg text")).fill]
                .map((colour) => colour.match(/\\d+/g).slice(0, 3)
                    .reduce((sum, part) => sum + Number(part), 0) / 3)"""
     )
@@ -199,7 +200,7 @@ def test_a_table_sorts(opened: Opened) -> None:
     assert rates() == before
 
 
-def test_missing_figures_sort_to_the_end(opened: Opened) -> None:
+def test_missing_numbers_sort_to_the_end(opened: Opened) -> None:
     table = opened.page.locator("#table-completion_times table")
     head = table.locator("thead th", has_text="Difference, s")
     place = opened.page.evaluate("head => head.cellIndex + 1", head.element_handle())
@@ -230,15 +231,15 @@ def test_videos_play(opened: Opened) -> None:
         assert state[2:] == [320, None]
 
 
-def test_figures_open_as_many_lines_as_they_say(opened: Opened) -> None:
-    study = opened.study
-    tables = {table.name: table for table in study_tables(study)}
-    for row, figures in zip(tables["success"].rows, study.arms, strict=True):
-        _, episodes, success, _, strict, _, in_time = row.cells
-        assert opened.count(link(episodes.selection)) == figures.outcomes.episodes == 60  # type: ignore[arg-type]
-        assert opened.count(link(success.selection)) == figures.success.count  # type: ignore[arg-type]
-        assert opened.count(link(strict.selection)) == figures.strict.count  # type: ignore[arg-type]
-        assert opened.count(link(in_time.selection)) == figures.in_time.count  # type: ignore[arg-type]
+def test_numbers_open_as_many_rows_as_they_say(opened: Opened) -> None:
+    statistics = opened.statistics
+    tables = {table.name: table for table in benchmark_tables(statistics)}
+    for row, c in zip(tables["success"].rows, statistics.conditions, strict=True):
+        _, episodes, success, _, strict, _, within = row.cells
+        assert opened.count(link(episodes.selection)) == c.outcomes.episodes == 60  # type: ignore[arg-type]
+        assert opened.count(link(success.selection)) == c.success.count  # type: ignore[arg-type]
+        assert opened.count(link(strict.selection)) == c.strict.count  # type: ignore[arg-type]
+        assert opened.count(link(within.selection)) == c.within_limit.count  # type: ignore[arg-type]
     for row in tables["success_by_training_seed"].rows:
         for cell in row.cells[1:3]:
             assert opened.count(link(cell.selection)) == 30  # type: ignore[arg-type]
@@ -256,31 +257,31 @@ def test_figures_open_as_many_lines_as_they_say(opened: Opened) -> None:
             assert opened.count(link(cell.selection)) == cell.values[0]  # type: ignore[arg-type]
     for row in tables["findings"].rows:
         episodes = row.cells[4]
-        arms = 1 + len(episodes.selection.versus)  # type: ignore[union-attr]
-        assert opened.count(link(episodes.selection)) == arms * episodes.values[0]  # type: ignore[arg-type,operator]
+        conditions = 1 + len(episodes.selection.versus)  # type: ignore[union-attr]
+        assert opened.count(link(episodes.selection)) == conditions * episodes.values[0]  # type: ignore[arg-type,operator]
 
 
 def test_a_click_opens_lines_that_say_where_they_stand(opened: Opened) -> None:
-    page, study = opened.page, opened.study
+    page, statistics = opened.page, opened.statistics
     page.locator("#table-failures tbody tr").first.locator("td").nth(1).get_by_role("link").click()
-    first = page.locator("#lines tbody tr").first
-    wanted = next(line for line in study.arms[0].lines if line.result.is_success)
+    first = page.locator("#rows tbody tr").first
+    wanted = next(row for row in statistics.conditions[0].rows if row.result.is_success)
     assert first.locator("td").all_inner_texts()[:5] == [
         f"results.jsonl:{wanted.number}",
-        wanted.result.arm,
+        wanted.result.condition,
         str(wanted.result.train_seed),
         str(wanted.result.seed),
         "success",
     ]
     assert first.get_by_role("link").get_attribute("href") == f"results.jsonl#L{wanted.number}"
-    page.locator("#lines thead button", has_text="Time").click()
-    times = [float(t) for t in page.locator("#lines tbody td:nth-child(7)").all_inner_texts()]
+    page.locator("#rows thead button", has_text="Time").click()
+    times = [float(t) for t in page.locator("#rows tbody td:nth-child(7)").all_inner_texts()]
     assert times == sorted(times)
-    page.locator("#lines thead button", has_text="Line").click()
-    places = page.locator("#lines tbody td:nth-child(1)").all_inner_texts()
+    page.locator("#rows thead button", has_text="ResultRow").click()
+    places = page.locator("#rows tbody td:nth-child(1)").all_inner_texts()
     numbers = [int(place.rpartition(":")[2]) for place in places]
     assert numbers == sorted(numbers)
     assert {1, 2} == {len(str(number)) for number in numbers}  # 9 comes before 10
     page.get_by_role("button", name="Close", exact=True).click()
-    page.locator("#lines").wait_for(state="hidden")
-    page.wait_for_url(opened.address)  # without the lines
+    page.locator("#rows").wait_for(state="hidden")
+    page.wait_for_url(opened.address)  # without the rows

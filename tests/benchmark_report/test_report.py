@@ -1,4 +1,4 @@
-"""The report as a page of text: whole, safe, the same each time, every figure with its lines."""
+"""The report as a page of text: whole, safe, the same each time, every figure with its rows."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ import cv2
 import numpy as np
 import pytest
 
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.benchmark.report.page import (
     EpisodeVideo,
-    ReportData,
+    Report,
     episodes_to_show,
+    general_facts,
     link,
+    make_report,
     read_video,
     render_report,
-    report_data,
-    study_facts,
     write_report,
 )
-from robo_manip_baselines.benchmark.statistics.conditions import FURTHER, Arm
-from robo_manip_baselines.benchmark.statistics.outcomes import Line, Selection
-from robo_manip_baselines.benchmark.statistics.study import Study, analyse
+from robo_manip_baselines.benchmark.statistics.conditions import FURTHER, ConditionDescription
+from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, RowSelection
+from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
 from robo_manip_baselines.rollout.videos import VideoWriter
 from robo_manip_baselines.runs.errors import RequestError
 
-MakeLines = Callable[..., tuple[Line, ...]]
+MakeRows = Callable[..., tuple[ResultRow, ...]]
 
 VOID = {"meta", "link", "br", "img", "hr"}
 EVIL = "</script><b onclick=alert(1)>\"'&"
@@ -66,18 +67,18 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def data(study: Study) -> ReportData:
-    videos = [EpisodeVideo(line, b"mp4", b"jpeg") for line in episodes_to_show(study)]
-    return report_data(study, title="Feeding", videos=videos, facts={"Machine": "two cores"})
+def report(statistics: BenchmarkStatistics) -> Report:
+    videos = [EpisodeVideo(row, b"mp4", b"jpeg") for row in episodes_to_show(statistics)]
+    return make_report(statistics, title="Feeding", videos=videos, facts={"Machine": "two cores"})
 
 
 @pytest.fixture(scope="module")
-def text(data: ReportData) -> str:
-    return render_report(data)
+def text(report: Report) -> str:
+    return render_report(report)
 
 
 @pytest.mark.long
-def test_the_page_is_whole(text: str, data: ReportData) -> None:
+def test_the_page_is_whole(text: str, report: Report) -> None:
     page = Page(text)
     names = page.all("id")
     assert len(names) == len(set(names))
@@ -85,10 +86,10 @@ def test_the_page_is_whole(text: str, data: ReportData) -> None:
     assert {anchor[1:] for anchor in anchors} <= set(names)
     labels = " ".join([*page.all("aria-labelledby"), *page.all("aria-describedby")]).split()
     assert set(labels) <= set(names)
-    for table in data.tables:
+    for table in report.tables:
         assert f"table-{table.name}" in names
-    for plot in data.plots:
-        assert f"plot-{plot.name}" in names
+    for figure in report.figures:
+        assert f"figure-{figure.name}" in names
     assert "<title>Feeding</title>" in text
     assert "two cores" in text
 
@@ -114,17 +115,17 @@ def test_the_page_needs_nothing_else(text: str) -> None:
 
 
 @pytest.mark.long
-def test_the_same_figures_give_the_same_page(text: str, data: ReportData) -> None:
-    assert render_report(data) == text
+def test_the_same_figures_give_the_same_page(text: str, report: Report) -> None:
+    assert render_report(report) == text
 
 
 @pytest.mark.long
-def test_every_figure_of_the_tables_has_its_lines(text: str, data: ReportData) -> None:
-    arms = {figures.arm.name for figures in data.study.arms}
-    links = [href for href in Page(text).all("href") if href.startswith("#lines?")]
+def test_every_figure_of_the_tables_has_its_rows(text: str, report: Report) -> None:
+    names = {c.condition.name for c in report.statistics.conditions}
+    links = [href for href in Page(text).all("href") if href.startswith("#rows?")]
     assert len(links) == sum(
         cell.selection is not None
-        for table in data.tables
+        for table in report.tables
         for row in table.rows
         for cell in row.cells
     )
@@ -132,11 +133,11 @@ def test_every_figure_of_the_tables_has_its_lines(text: str, data: ReportData) -
         query = parse_qs(href.partition("?")[2])
         assert set(query) <= {
             "is_different",
-            *("arm", "versus", "train_seed", "is_success", "is_strict", "within", "failure"),
+            *("condition", "versus", "train_seed", "is_success", "is_strict", "within", "failure"),
         }
-        assert {*query["arm"], *query.get("versus", [""])[0].split(",")} <= arms | {""}
-    # What has no lines is words, the paper's, or nothing.
-    for table in data.tables:
+        assert {*query["condition"], *query.get("versus", [""])[0].split(",")} <= names | {""}
+    # What has no rows is words, the paper's, or nothing.
+    for table in report.tables:
         for row in table.rows:
             for column, cell in zip(table.columns, row.cells, strict=True):
                 if cell.selection is None and cell.text != "–":
@@ -144,109 +145,114 @@ def test_every_figure_of_the_tables_has_its_lines(text: str, data: ReportData) -
 
 
 @pytest.mark.long
-def test_all_lines_are_in_the_page(text: str, lines: tuple[Line, ...]) -> None:
-    found = re.search(r'<script type="application/json" id="lines-data">(.*?)</script>', text)
+def test_all_rows_are_in_the_page(text: str, rows: tuple[ResultRow, ...]) -> None:
+    found = re.search(r'<script type="application/json" id="rows-data">(.*?)</script>', text)
     assert found is not None
     content = json.loads(found[1])
     assert content["files"] == ["results.jsonl"]
-    by_number = {row[1]: row for row in content["rows"]}
-    assert len(by_number) == len(lines)
-    for line in lines[::97]:
-        r = line.result
-        row = by_number[line.number]
-        assert row[2:9] == [
-            *(r.arm, r.train_seed, r.seed, r.is_success, r.is_success_strict),
-            *(r.completion_time, r.failure),
+    by_number = {values[1]: values for values in content["rows"]}
+    assert len(by_number) == len(rows)
+    assert content["columns"] == ["Closest offset, mm", "Face force, N"]
+    for row in rows[::97]:
+        r = row.result
+        values = by_number[row.number]
+        assert values[2:10] == [
+            *(r.condition, r.train_seed, r.seed, r.is_success, r.is_success_strict),
+            *(r.completion_time, r.failure, r.motion_clip),
         ]
-        if r.closest_offset:
-            assert row[9] == pytest.approx([1000 * x for x in r.closest_offset], abs=0.051)
+        offset = r.columns["closest_offset"]
+        if offset:
+            assert values[10] == pytest.approx([1000 * x for x in offset], abs=0.0051)
+        else:
+            assert values[10] is None
+        assert values[11] == r.columns["face_force"]
 
 
 @pytest.mark.long
-def test_each_arm_shows_a_success_and_a_failure(text: str, data: ReportData) -> None:
+def test_each_condition_shows_a_success_and_a_failure(text: str, report: Report) -> None:
     labels = [a["aria-label"] or "" for tag, a in Page(text).attributes if tag == "video"]
     assert len(labels) == 32
-    for place, figures in enumerate(data.study.arms):
+    for place, c in enumerate(report.statistics.conditions):
         success, failure = labels[2 * place : 2 * place + 2]
-        assert success.startswith(f"{figures.arm.label}, seed ")
+        assert success.startswith(f"{c.condition.label}, seed ")
         assert success.endswith(": success")
         assert not failure.endswith(": success")
 
 
 @pytest.mark.long
-def test_hostile_names_stay_words(make_lines: MakeLines) -> None:
-    lines = make_lines(arms=["current", "baseline"], train_seeds=1, episodes=4)
+def test_hostile_names_stay_words(make_rows: MakeRows) -> None:
+    rows = make_rows(conditions=["current", "baseline"], train_seeds=1, episodes=4)
     evil = tuple(
-        replace(line, file=EVIL, result=replace(line.result, arm=EVIL, motion_clip=EVIL))
-        if line.result.arm == "baseline"
-        else line
-        for line in lines
+        replace(row, file=EVIL, result=replace(row.result, condition=EVIL, motion_clip=EVIL))
+        if row.result.condition == "baseline"
+        else row
+        for row in rows
     )
-    described = {EVIL: Arm(EVIL, f"label {EVIL}", FURTHER)}
-    study = analyse(evil, resamples=50, described=described)
+    described = {EVIL: ConditionDescription(EVIL, f"label {EVIL}", FURTHER)}
+    statistics = analyze(evil, task=TASK, resamples=50, conditions=described)
     video = EpisodeVideo(evil[0], b"", b"")
-    page = render_report(report_data(study, title=EVIL, videos=[video], facts={EVIL: EVIL}))
+    page = render_report(make_report(statistics, title=EVIL, videos=[video], facts={EVIL: EVIL}))
     assert "<b onclick" not in page
     found = [tag for tag, _ in Page(page).attributes]
     assert found.count("script") == 2
-    links = [href for href in Page(page).all("href") if href.startswith("#lines?")]
-    assert any(parse_qs(href.partition("?")[2])["arm"] == [EVIL] for href in links)
+    links = [href for href in Page(page).all("href") if href.startswith("#rows?")]
+    assert any(parse_qs(href.partition("?")[2])["condition"] == [EVIL] for href in links)
 
 
 def test_links() -> None:
-    assert link(Selection("a b&c")) == "#lines?arm=a+b%26c"
-    assert link(Selection("a", train_seed=0, is_success=False)) == (
-        "#lines?arm=a&train_seed=0&is_success=false"
+    assert link(RowSelection("a b&c")) == "#rows?condition=a+b%26c"
+    assert link(RowSelection("a", train_seed=0, is_success=False)) == (
+        "#rows?condition=a&train_seed=0&is_success=false"
     )
-    assert link(Selection("a", versus=("b,c", "d"), is_different=True)) == (
-        "#lines?arm=a&versus=b%252Cc%2Cd&is_different=true"
+    assert link(RowSelection("a", versus=("b,c", "d"), is_different=True)) == (
+        "#rows?condition=a&versus=b%252Cc%2Cd&is_different=true"
     )
-    assert link(Selection("a", is_strict=True, failure="dropped")) == (
-        "#lines?arm=a&is_strict=true&failure=dropped"
+    assert link(RowSelection("a", is_strict=True, failure="dropped")) == (
+        "#rows?condition=a&is_strict=true&failure=dropped"
     )
 
 
 @pytest.mark.long
-def test_facts_of_the_study(study: Study) -> None:
-    assert study_facts(study) == {
+def test_facts_of_the_study(statistics: BenchmarkStatistics) -> None:
+    assert general_facts(statistics) == {
         "Environment": "FeedingEnv",
-        "Episodes": "3200 of 16 arms",
+        "Episodes": "3200 of 16 conditions",
         "Training seeds": "0, 1",
-        "Evaluation seeds": "100 that all arms have, from 1000 to 1099",
+        "Evaluation seeds": "100 that all conditions have, from 1000 to 1099",
         "Recorded motion": "7 clips of 5 people",
         "Versions": "numpy 2",
     }
 
 
 @pytest.mark.long
-def test_episodes_to_show_are_the_first_of_their_kind(make_lines: MakeLines) -> None:
-    lines = make_lines(arms=["baseline"], train_seeds=2, episodes=20)
-    ordered = sorted(lines, key=lambda line: (line.result.train_seed or 0, line.result.seed))
-    study = analyse(tuple(reversed(lines)), resamples=50)
-    success, failure = episodes_to_show(study)
-    assert success == next(line for line in ordered if line.result.is_success)
-    kinds = [line.result.failure for line in ordered if not line.result.is_success]
+def test_episodes_to_show_are_the_first_of_their_kind(make_rows: MakeRows) -> None:
+    rows = make_rows(conditions=["baseline"], train_seeds=2, episodes=20)
+    ordered = sorted(rows, key=lambda row: (row.result.train_seed or 0, row.result.seed))
+    statistics = analyze(tuple(reversed(rows)), task=TASK, resamples=50)
+    success, failure = episodes_to_show(statistics)
+    assert success == next(row for row in ordered if row.result.is_success)
+    kinds = [row.result.failure for row in ordered if not row.result.is_success]
     assert kinds.count(failure.result.failure) == max(map(kinds.count, kinds))
     assert failure == next(
-        line for line in ordered if line.result.failure == failure.result.failure
+        row for row in ordered if row.result.failure == failure.result.failure
     )
-    won = tuple(line for line in lines if line.result.is_success)
-    assert len(episodes_to_show(analyse(won, resamples=50))) == 1
+    won = tuple(row for row in rows if row.result.is_success)
+    assert len(episodes_to_show(analyze(won, task=TASK, resamples=50))) == 1
 
 
 @pytest.mark.long
-def test_files(tmp_path: Path, data: ReportData, text: str) -> None:
+def test_files(tmp_path: Path, report: Report, text: str) -> None:
     path = tmp_path / "new" / "report.html"
-    write_report(path, data)
+    write_report(path, report)
     assert path.read_text(encoding="utf-8") == text
     assert [p.name for p in path.parent.iterdir()] == ["report.html"]
     (tmp_path / "file").write_text("")
     with pytest.raises(RequestError, match="cannot write"):
-        write_report(tmp_path / "file" / "report.html", data)
+        write_report(tmp_path / "file" / "report.html", report)
 
 
-def test_videos_are_made_small(tmp_path: Path, make_lines: MakeLines) -> None:
-    (line,) = make_lines(arms=["current"], train_seeds=1, episodes=1)
+def test_videos_are_made_small(tmp_path: Path, make_rows: MakeRows) -> None:
+    (row,) = make_rows(conditions=["current"], train_seeds=1, episodes=1)
     path = tmp_path / "long.mp4"
     rng = np.random.default_rng(0)
     with VideoWriter(path, 25.0) as video:
@@ -254,8 +260,8 @@ def test_videos_are_made_small(tmp_path: Path, make_lines: MakeLines) -> None:
             image = rng.integers(0, 60, (90, 1600, 3), dtype=np.uint8)
             image[:, : 50 * number] = (200, 0, 0)
             video.write(image)
-    found = read_video(path, line)
-    assert found.line is line
+    found = read_video(path, row)
+    assert found.row is row
     assert len(found.content) < path.stat().st_size / 2
     with av.open(io.BytesIO(found.content)) as container:
         (track,) = container.streams.video
@@ -270,9 +276,9 @@ def test_videos_are_made_small(tmp_path: Path, make_lines: MakeLines) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no video"])
-def test_videos_that_are_none(tmp_path: Path, make_lines: MakeLines, content: bytes | None) -> None:
-    (line,) = make_lines(arms=["current"], train_seeds=1, episodes=1)
+def test_videos_that_are_none(tmp_path: Path, make_rows: MakeRows, content: bytes | None) -> None:
+    (row,) = make_rows(conditions=["current"], train_seeds=1, episodes=1)
     if content is not None:
         (tmp_path / "v.mp4").write_bytes(content)
     with pytest.raises(RequestError, match=r"v\.mp4' cannot be read .*; evaluate with --video"):
-        read_video(tmp_path / "v.mp4", line)
+        read_video(tmp_path / "v.mp4", row)

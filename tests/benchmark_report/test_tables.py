@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.benchmark.statistics.findings import findings
-from robo_manip_baselines.benchmark.statistics.outcomes import Line, Selection
-from robo_manip_baselines.benchmark.statistics.study import Study, analyse
-from robo_manip_baselines.benchmark.tables.study import (
+from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow
+from robo_manip_baselines.benchmark.tables.benchmark import (
+    benchmark_tables,
     later,
-    p_cell,
+    p_text,
+    p_values,
     percent,
     points,
     seconds,
-    study_tables,
 )
 from robo_manip_baselines.benchmark.tables.table import (
     Cell,
@@ -32,8 +32,8 @@ from robo_manip_baselines.benchmark.tables.table import (
     to_markdown,
     write_tables,
 )
-from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import FAILURES
-from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
+from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import STUDY
 
 SMALL = Table(
     "small",
@@ -94,23 +94,30 @@ def test_a_table_with_a_hole_is_refused() -> None:
         replace(SMALL, rows=(replace(row, cells=(row.cells[0], Cell("1", (1,)))),))
 
 
-def test_figures_are_spelt_alike() -> None:
-    assert [percent(x) for x in (0.74, 1.0, None)] == ["74.0 %", "100.0 %", "–"]
+def test_numbers_are_formatted_alike() -> None:
+    assert [percent(x) for x in (0.74, 1.0)] == ["74.0 %", "100.0 %"]
     assert [points(x) for x in (0.04, -0.125, -0.0001, 0.0)] == ["+4.0", "−12.5", "0.0", "0.0"]
-    assert [later(x) for x in (0.25, -0.25, -0.001, None)] == ["+0.25", "−0.25", "0.00", "–"]
+    assert [later(x) for x in (0.25, -0.25, -0.001)] == ["+0.25", "−0.25", "0.00"]
     assert seconds(4.305) == "4.30"
-    own = Selection("a")
-    assert [p_cell(p, own).text for p in (0.0004, 0.0496, None)] == ["< 0.001", "0.050", "–"]
-    assert [p_cell(p, own, is_strong=True).is_strong for p in (0.049, 0.05, None)] == [
-        True,
-        False,
-        False,
-    ]
+    assert [p_text(p) for p in (0.0004, 0.0496)] == ["< 0.001", "0.050"]
 
 
 @pytest.mark.long
-def test_written_whole_in_three_formats(tmp_path: Path, study: Study) -> None:
-    tables = study_tables(study)
+def test_p_values_are_bold_below_the_limit(statistics: BenchmarkStatistics) -> None:
+    found = [
+        replace(c, success_difference=replace(c.success_difference, p=p, p_holm=p))
+        for c, p in zip(statistics.conditions, (0.049, 0.05, None), strict=False)
+    ]
+    raw, corrected = (column.cells(found) for column in p_values("A", "success_difference", {}))
+    assert [cell.text for cell in corrected] == ["0.049", "0.050", "–"]
+    assert [cell.is_strong for cell in corrected] == [True, False, False]
+    assert not any(cell.is_strong for cell in raw)
+    assert [cell.selection is None for cell in raw] == [False, False, True]
+
+
+@pytest.mark.long
+def test_written_whole_in_three_formats(tmp_path: Path, statistics: BenchmarkStatistics) -> None:
+    tables = benchmark_tables(statistics)
     paths = write_tables(tmp_path / "tables", tables)
     assert {path.suffix for path in paths} == {".md", ".csv", ".tex"}
     assert len(set(paths)) == 3 * len(tables) == 24
@@ -133,32 +140,32 @@ def rows_of(tables: tuple[Table, ...], name: str) -> dict[str, dict[str, str]]:
 
 
 @pytest.mark.long
-def test_rows_of_the_benchmark(study: Study) -> None:
-    tables = study_tables(study)
-    arms = [figures.arm.name for figures in study.arms]
-    assert list(rows_of(tables, "success")) == arms
-    assert list(rows_of(tables, "completion_times")) == arms
-    assert list(rows_of(tables, "failures")) == arms
-    assert list(rows_of(tables, "success_differences")) == [a for a in arms if a != "current"]
-    assert list(rows_of(tables, "success_beside_paper")) == [a for a in arms if a in PAPER]
-    assert list(rows_of(tables, "completion_times_beside_paper")) == [a for a in arms if a in PAPER]
+def test_rows_of_the_benchmark(statistics: BenchmarkStatistics) -> None:
+    tables = benchmark_tables(statistics)
+    names = [c.condition.name for c in statistics.conditions]
+    assert list(rows_of(tables, "success")) == names
+    assert list(rows_of(tables, "completion_times")) == names
+    assert list(rows_of(tables, "failures")) == names
+    assert list(rows_of(tables, "success_differences")) == [n for n in names if n != "current"]
+    assert list(rows_of(tables, "success_beside_paper")) == [n for n in names if n in STUDY.published]
+    assert list(rows_of(tables, "completion_times_beside_paper")) == [n for n in names if n in STUDY.published]
     verdicts = rows_of(tables, "findings")
     assert [row["paper"] == "" for row in verdicts.values()] == 5 * [False] + [True]
 
-    figures = study.arms[0]
+    first = statistics.conditions[0]
     row = rows_of(tables, "success")["baseline"]
     assert int(row["episodes"]) == 200
-    assert float(row["success"]) == figures.success.rate
-    assert (float(row["low"]), float(row["high"])) == (figures.success.low, figures.success.high)
-    assert float(row["strict_high"]) == figures.strict.high
+    assert float(row["success"]) == first.success.rate
+    assert (float(row["low"]), float(row["high"])) == (first.success.low, first.success.high)
+    assert float(row["strict_high"]) == first.strict.high
     runs = rows_of(tables, "success_by_training_seed")["baseline"]
-    for seed, part in figures.success_by_seed.items():
+    for seed, part in first.success_by_seed.items():
         assert float(runs[f"seed_{seed}"]) == part.rate
         assert float(runs[f"seed_{seed}_low"]) == part.low
-    rates = [part.rate or 0.0 for part in figures.success_by_seed.values()]
+    rates = [part.rate or 0.0 for part in first.success_by_seed.values()]
     assert float(runs["range"]) == pytest.approx(abs(rates[0] - rates[1]))
     ends = rows_of(tables, "failures")["baseline"]
-    assert int(ends["success"]) + sum(int(ends[kind]) for kind in FAILURES) == 200
+    assert int(ends["success"]) + sum(int(ends[kind]) for kind in TASK.failures) == 200
     beside = rows_of(tables, "success_beside_paper")["current_pred_h2"]
     assert beside["paper_success"] == "0.74"
     assert beside["is_compatible"] in ("true", "false")
@@ -166,11 +173,11 @@ def test_rows_of_the_benchmark(study: Study) -> None:
 
 @pytest.mark.long
 def test_one_training_seed_has_no_columns_for_several(
-    make_lines: Callable[..., tuple[Line, ...]],
+    make_rows: Callable[..., tuple[ResultRow, ...]],
 ) -> None:
-    lines = make_lines(arms=["shuffled_future"], train_seeds=1, episodes=6)
-    tables = study_tables(analyse(lines, resamples=50))
-    # Nothing to compare with: neither another arm, nor the paper, nor a finding.
+    rows = make_rows(conditions=["shuffled_future"], train_seeds=1, episodes=6)
+    tables = benchmark_tables(analyze(rows, task=TASK, resamples=50))
+    # Nothing to compare with: neither another condition, nor the paper, nor a finding.
     assert [table.name for table in tables] == ["success", "completion_times", "failures"]
     assert "by_training_seed" not in to_csv(tables[1])
     assert "bootstrap" not in to_markdown(tables[0])
@@ -179,18 +186,17 @@ def test_one_training_seed_has_no_columns_for_several(
 
 @pytest.mark.long
 def test_no_difference_seen_is_not_no_difference(
-    make_lines: Callable[..., tuple[Line, ...]],
+    make_rows: Callable[..., tuple[ResultRow, ...]],
 ) -> None:
-    """Two arms that end alike in four episodes: the claim's interval is the paired one's."""
-    lines = make_lines(arms=["baseline", "current"], train_seeds=1, episodes=4)
+    """Two conditions that end alike in four episodes: the claim's interval is the paired one's."""
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=4)
     alike = [
-        replace(line, result=replace(line.result, is_success=False, completion_time=None))
-        for line in lines
+        replace(row, result=replace(row.result, is_success=False, completion_time=None))
+        for row in rows
     ]
-    study = analyse(alike, resamples=50)
-    (claim,) = findings(study)
-    pairs = study.arms[0].paired_success
-    assert pairs is not None
+    statistics = analyze(alike, task=TASK, resamples=50)
+    (claim,) = statistics.findings
+    pairs = statistics.conditions[0].success_difference
     assert claim.verdict == "undecided"
     assert claim.contrast.high == pairs.difference.high == pytest.approx(1 - 0.025 ** (1 / 4))
     assert claim.contrast.low == pairs.difference.low
@@ -199,11 +205,25 @@ def test_no_difference_seen_is_not_no_difference(
 @pytest.mark.long
 @pytest.mark.parametrize("train_seeds", [1, 2])
 def test_verdicts_on_one_training_run_say_so(
-    make_lines: Callable[..., tuple[Line, ...]], train_seeds: int
+    make_rows: Callable[..., tuple[ResultRow, ...]], train_seeds: int
 ) -> None:
-    lines = make_lines(arms=["baseline", "current"], train_seeds=train_seeds, episodes=6)
-    claims = study_tables(analyse(lines, resamples=50))[0]
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=train_seeds, episodes=6)
+    claims = benchmark_tables(analyze(rows, task=TASK, resamples=50))[0]
     assert claims.name == "findings"
-    assert any("one training run of each arm" in note for note in claims.notes) is (
+    assert any("one training run of each condition" in note for note in claims.notes) is (
         train_seeds == 1
     )
+
+
+@pytest.mark.long
+def test_a_task_without_a_study(make_rows: Callable[..., tuple[ResultRow, ...]]) -> None:
+    """All tables but those of the paper, without its names, without the column of a time limit."""
+    task = replace(TASK, success_time_limit=None, study="", strict_success="", failures={})
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=6)
+    tables = {t.name: t for t in benchmark_tables(analyze(rows, task=task, resamples=50))}
+    assert list(tables) == ["success", "success_differences", "completion_times", "failures"]
+    assert tables["success"].title == "Success rates"
+    assert tables["completion_times"].title == "Completion times"
+    assert len(tables["success"].columns) == 6
+    assert len(tables["failures"].columns) == 3
+    assert "aper" not in "".join(map(to_markdown, tables.values()))

@@ -1,0 +1,279 @@
+"""All statistics of a benchmark, computed from its result rows."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robo_manip_baselines.benchmark.statistics.conditions import (
+    CURRENT,
+    ConditionDescription,
+    describe_condition,
+    sort_conditions,
+)
+from robo_manip_baselines.benchmark.statistics.inference import (
+    NO_COMPARISON,
+    RESAMPLES,
+    Comparison,
+    Estimate,
+    bound_unseen,
+    holm,
+    mean_estimate,
+    paired_success,
+    paired_times,
+    proportion,
+    published_success,
+    published_time,
+    rate_estimate,
+)
+from robo_manip_baselines.benchmark.statistics.outcomes import (
+    Floats,
+    OutcomeMatrix,
+    ResultRow,
+    on_common_seeds,
+    outcome_matrix,
+    sorted_train_seeds,
+)
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    Claim,
+    PublishedResult,
+    TaskEntry,
+    TaskStudy,
+)
+from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.rollout.results import Proportion
+from robo_manip_baselines.runs.errors import RequestError, require_choice
+
+_COMPARISONS = ("success_difference", "time_difference", "published_success", "published_time")
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionStatistics:
+    """Statistics of one condition.
+
+    Attributes:
+        condition: its name and label.
+        rows: its result rows.
+        outcomes: the same as a matrix.
+        success, strict: rates over all episodes, see `rate_estimate`.
+        within_limit: success within the task's time limit, likewise; None where it has none.
+        success_by_seed: training seed -> rate of its episodes, with Wilson's interval.
+        time: s, mean completion time of successes.
+        time_by_seed: training seed -> mean, s; None without a success.
+        published: result in the paper; None where it has no such condition.
+        success_difference, time_difference: from the reference, on common seeds; `NO_COMPARISON`
+            for the reference itself.
+        published_success, published_time: against the paper, likewise without such a condition.
+    """
+
+    condition: ConditionDescription
+    rows: tuple[ResultRow, ...]
+    outcomes: OutcomeMatrix
+    success: Proportion
+    strict: Proportion
+    within_limit: Proportion | None
+    success_by_seed: dict[int | None, Proportion]
+    time: Estimate
+    time_by_seed: dict[int | None, float | None]
+    published: PublishedResult | None = None
+    success_difference: Comparison = NO_COMPARISON
+    time_difference: Comparison = NO_COMPARISON
+    published_success: Comparison = NO_COMPARISON
+    published_time: Comparison = NO_COMPARISON
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Answer of the data to a claim.
+
+    Attributes:
+        claim: in question.
+        contrast: between conditions, episode by episode.
+        published: the same contrast of the paper's results; None where it has not all of the
+            conditions.
+    """
+
+    claim: Claim
+    contrast: Estimate
+    published: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """``holds`` or ``does not hold`` where the interval lies on one side of the limit."""
+        low, high, limit = self.contrast.low, self.contrast.high, self.claim.limit
+        if low is None or high is None:
+            return "no answer"
+        return "holds" if low > limit else "does not hold" if high < limit else "undecided"
+
+
+@dataclass(frozen=True, eq=False)
+class BenchmarkStatistics:
+    """Statistics of all conditions of a benchmark.
+
+    Attributes:
+        task: that the conditions were evaluated on.
+        study: its published results, claims and figures.
+        conditions: in the order of the paper's table, further ones last.
+        reference: name of the condition that the others are compared with.
+        seeds: evaluation seeds that all conditions have, with every training seed.
+        findings: on the claims whose conditions were all evaluated.
+    """
+
+    task: TaskEntry
+    study: TaskStudy
+    conditions: tuple[ConditionStatistics, ...]
+    reference: str
+    seeds: tuple[int, ...]
+    findings: tuple[Finding, ...]
+
+    def of(self, name: str) -> ConditionStatistics:
+        """Return the statistics of a condition by its name.
+
+        Raises:
+            KeyError: it was not evaluated.
+        """
+        return {c.condition.name: c for c in self.conditions}[name]
+
+    @property
+    def train_seeds(self) -> tuple[int | None, ...]:
+        """Training seeds of any condition; None is a policy that was not trained."""
+        return sorted_train_seeds(s for c in self.conditions for s in c.outcomes.train_seeds)
+
+    @property
+    def has_many_train_seeds(self) -> bool:
+        """Whether any condition was trained more than once."""
+        return any(len(c.outcomes.train_seeds) > 1 for c in self.conditions)
+
+
+def analyze(
+    rows: Sequence[ResultRow],
+    *,
+    task: TaskEntry,
+    reference: str | None = None,
+    conditions: Mapping[str, ConditionDescription] | None = None,
+    seed: int = 0,
+    resamples: int = RESAMPLES,
+) -> BenchmarkStatistics:
+    """Compute all statistics.
+
+    The same rows give the same numbers, and the interval of a condition does not depend on which
+    other conditions there are.
+
+    Args:
+        rows: of all conditions, see `read_result_rows`.
+        task: that they are of.
+        reference: condition that the others are compared with; None takes ``current``, or the
+            first one where that was not evaluated.
+        conditions: name -> description of conditions whose rows do not describe them; may hold
+            others, too.
+        seed: of the resampling.
+        resamples: of each bootstrap.
+
+    Raises:
+        RequestError: there are no rows, or none of the reference.
+    """
+    if not rows:
+        raise RequestError("there are no result rows; evaluate a condition first")
+    grouped: dict[str, list[ResultRow]] = {}
+    for row in rows:
+        grouped.setdefault(row.result.condition, []).append(row)
+    declared = conditions or {}
+    described = sort_conditions(
+        (declared.get(name) or _described_by(name, own) for name, own in grouped.items()),
+        given=list(declared),
+    )
+    if reference is None:
+        reference = next((c.name for c in described if c.group == CURRENT), described[0].name)
+    require_choice("reference condition", reference, grouped)
+    study = task.load_study()
+    outcomes = {name: outcome_matrix(own) for name, own in grouped.items()}
+
+    limit = task.success_time_limit
+
+    def rng(name: str, measure: str) -> np.random.Generator:
+        return _generator(seed, f"{name}/{measure}")
+
+    def statistics_of(condition: ConditionDescription) -> ConditionStatistics:
+        name = condition.name
+        own, published = outcomes[name], study.published.get(name)
+
+        def rate(grid: Floats, measure: str) -> Proportion:
+            return rate_estimate(grid, rng(name, measure), resamples)
+
+        def difference(compare: Callable[..., Comparison], measure: str) -> Comparison:
+            if name == reference:
+                return NO_COMPARISON
+            ours, theirs = on_common_seeds([own, outcomes[reference]], measure)
+            return compare(ours, theirs, rng(name, f"{measure} difference"), resamples)
+
+        success = rate(own.success, "success")
+        return ConditionStatistics(
+            condition,
+            tuple(grouped[name]),
+            own,
+            success,
+            strict=rate(own.strict, "strict"),
+            within_limit=None if limit is None else rate(own.success_within(limit), "in time"),
+            success_by_seed=dict(zip(own.train_seeds, map(proportion, own.success), strict=True)),
+            time=mean_estimate(own.time, rng(name, "time"), resamples),
+            time_by_seed={
+                train_seed: float(np.nanmean(row)) if np.isfinite(row).any() else None
+                for train_seed, row in zip(own.train_seeds, own.time, strict=True)
+            },
+            published=published,
+            success_difference=difference(paired_success, "success"),
+            time_difference=difference(paired_times, "time"),
+            published_success=published_success(success, own.episodes, published, study.trials),
+            published_time=published_time(own.time, published, study.time_rounding),
+        )
+
+    found = [statistics_of(condition) for condition in described]
+    for kind in _COMPARISONS:
+        corrected = holm([getattr(c, kind) for c in found])
+        found = [replace(c, **{kind: new}) for c, new in zip(found, corrected, strict=True)]
+    claims = [claim for claim in study.claims if set(claim.weights) <= set(outcomes)]
+    findings = tuple(_finding(claim, study, outcomes, seed, resamples) for claim in claims)
+    seeds = set.intersection(*(own.complete_seeds for own in outcomes.values()))
+    return BenchmarkStatistics(
+        task, study, tuple(found), reference, tuple(sorted(seeds)), findings
+    )
+
+
+def _generator(seed: int, text: str) -> np.random.Generator:
+    return np.random.default_rng([seed, zlib.crc32(text.encode())])
+
+
+def _described_by(name: str, rows: Sequence[ResultRow]) -> ConditionDescription:
+    spec = rows[0].result.observation
+    return describe_condition(name, ObservationSpec.from_json(spec) if spec else None)
+
+
+def _finding(
+    claim: Claim,
+    study: TaskStudy,
+    outcomes: Mapping[str, OutcomeMatrix],
+    seed: int,
+    resamples: int,
+) -> Finding:
+    """Take the contrast of a claim over the seeds that all of its conditions have.
+
+    Times are compared over episodes in which all of them succeeded.
+    """
+    rng = _generator(seed, claim.text)
+    matrices = on_common_seeds([outcomes[name] for name in claim.weights], claim.measure)
+    contrast = np.tensordot(list(claim.weights.values()), matrices, axes=1)
+    estimate = mean_estimate(contrast, rng, resamples)
+    is_success = claim.measure == "success"
+    if is_success and estimate.n and not np.nan_to_num(contrast).any():
+        estimate = bound_unseen(estimate)
+    values = {
+        name: result.successes / study.trials if is_success else result.completion_time
+        for name, result in study.published.items()
+    }
+    published = None
+    if set(claim.weights) <= set(values):
+        published = sum(weight * values[name] for name, weight in claim.weights.items())
+    return Finding(claim, estimate, published)

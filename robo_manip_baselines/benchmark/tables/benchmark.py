@@ -1,0 +1,462 @@
+"""Tables of a benchmark. Most have a row for each condition, and are lists of `Statistic`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+from robo_manip_baselines.benchmark.statistics.analysis import (
+    BenchmarkStatistics,
+    ConditionStatistics,
+    Finding,
+)
+from robo_manip_baselines.benchmark.statistics.inference import SIGNIFICANCE
+from robo_manip_baselines.benchmark.statistics.outcomes import RowSelection
+from robo_manip_baselines.benchmark.tables.table import NOTHING, Cell, Column, Row, Table
+
+
+def benchmark_tables(statistics: BenchmarkStatistics) -> tuple[Table, ...]:
+    """Return all tables that have a row, the most important first."""
+    tables = (
+        findings_table(statistics),
+        success_table(statistics),
+        success_by_training_seed(statistics),
+        success_differences(statistics),
+        success_beside_paper(statistics),
+        times_table(statistics),
+        times_beside_paper(statistics),
+        failures_table(statistics),
+    )
+    return tuple(table for table in tables if table.rows)
+
+
+def percent(rate: float) -> str:
+    """Format a rate, ``74.0 %``."""
+    return f"{100.0 * rate:.1f} %"
+
+
+def points(difference: float) -> str:
+    """Format a difference of rates in percentage points, ``−3.5``."""
+    return _signed(f"{100.0 * difference:+.1f}")
+
+
+def seconds(time: float) -> str:
+    """Format a time in seconds, ``4.31``."""
+    return f"{time:.2f}"
+
+
+def later(difference: float) -> str:
+    """Format a difference of times in seconds, ``+0.20``."""
+    return _signed(f"{difference:+.2f}")
+
+
+def p_text(p: float) -> str:
+    """Format a p-value."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _signed(number: str) -> str:
+    """Write a minus sign, and no sign before zero."""
+    return number.lstrip("+-") if float(number) == 0.0 else number.replace("-", "−")
+
+
+def _ends(text: Callable[[float], str]) -> Callable[[float, float], str]:
+    """Return the function that formats both ends of an interval."""
+    return lambda low, high: f"{text(low)} to {text(high)}".replace(" % to", " to")
+
+
+# Which cells of a column are in bold, from a value and all values of the column.
+
+
+def highest(value: float, column: Sequence[float]) -> bool:
+    """Return whether a value is the highest of its column."""
+    return value == max(column)
+
+
+def lowest(value: float, column: Sequence[float]) -> bool:
+    """Return whether a value is the lowest of its column."""
+    return value == min(column)
+
+
+def significant(value: float, _: Sequence[float]) -> bool:
+    """Return whether a p-value is called significant."""
+    return value < SIGNIFICANCE
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """Column of a statistic of all conditions.
+
+    Attributes:
+        title: heading.
+        names: of the values in the CSV, with spaces between them.
+        text: formats the values for readers.
+        values: paths of attributes of `ConditionStatistics`, one for each name; or a function that
+            returns the values. A cell whose first value is None is empty.
+        rows: selects the result rows that the values are computed from, by the attributes of
+            `RowSelection` beside the condition; None if from none.
+        strong: whether a value is set in bold, given all of the column; never if None.
+        is_text: whether cells hold words, not numbers.
+    """
+
+    title: str
+    names: str
+    text: Callable[..., str]
+    values: str | Callable[[ConditionStatistics], tuple[Any, ...]]
+    rows: dict[str, Any] | None
+    strong: Callable[[Any, Sequence[Any]], bool] | None = None
+    is_text: bool = False
+
+    @property
+    def column(self) -> Column:
+        """Column of the table."""
+        return Column(self.title, tuple(self.names.split()), self.is_text)
+
+    def cells(self, conditions: Sequence[ConditionStatistics]) -> list[Cell]:
+        """Make the cells of all conditions."""
+        if callable(self.values):
+            values = list(map(self.values, conditions))
+        else:
+            getters = [attrgetter(path) for path in self.values.split()]
+            values = [tuple(get(c) for get in getters) for c in conditions]
+        first = [value[0] for value in values if value[0] is not None]
+        return [
+            Cell(NOTHING, value)
+            if value[0] is None
+            else Cell(
+                self.text(*value),
+                value,
+                None if self.rows is None else RowSelection(c.condition.name, **self.rows),
+                self.strong is not None and self.strong(value[0], first),
+            )
+            for c, value in zip(conditions, values, strict=True)
+        ]
+
+
+ALL: dict[str, Any] = {}
+SUCCESSES = {"is_success": True}
+
+
+def interval(
+    title: str,
+    text: Callable[[float], str],
+    estimate: str,
+    rows: dict[str, Any],
+    prefix: str = "",
+) -> Statistic:
+    """Make the column of a 95 % interval, given the path of an estimate."""
+    names = f"{prefix}low {prefix}high"
+    return Statistic(title, names, _ends(text), f"{estimate}.low {estimate}.high", rows)
+
+
+def p_values(test: str, comparison: str, rows: dict[str, Any]) -> list[Statistic]:
+    """Make the columns of a test's p-values, given the path of a comparison."""
+    return [
+        Statistic(f"{test} p", "p", p_text, f"{comparison}.p", rows),
+        Statistic("Holm p", "p_holm", p_text, f"{comparison}.p_holm", rows, significant),
+    ]
+
+
+def beside_paper(
+    test: str, comparison: str, unit: str, text: Callable[[float], str], rows: dict[str, Any]
+) -> list[Statistic]:
+    """Make the columns of a comparison with published results, given its path."""
+
+    def is_compatible(c: ConditionStatistics) -> tuple[bool | None]:
+        p = getattr(c, comparison).p_holm
+        return (None if p is None else p >= SIGNIFICANCE,)
+
+    yes_or_no = {True: "yes", False: "no"}.__getitem__
+    difference = f"{comparison}.difference"
+    return [
+        Statistic(f"Here − paper{unit}", "difference", text, f"{difference}.mean", rows),
+        interval("95 % interval", text, difference, rows),
+        *p_values(test, comparison, rows),
+        Statistic("Compatible", "is_compatible", yes_or_no, is_compatible, None, is_text=True),
+    ]
+
+
+def condition_table(
+    name: str,
+    title: str,
+    conditions: Sequence[ConditionStatistics],
+    columns: Sequence[Statistic],
+    notes: Sequence[str],
+) -> Table:
+    """Make a table with a row for each condition, its label first."""
+    labels = [Cell(c.condition.label, (c.condition.name,)) for c in conditions]
+    cells = zip(labels, *(column.cells(conditions) for column in columns), strict=True)
+    rows = [Row(c.condition.group, own) for c, own in zip(conditions, cells, strict=True)]
+    head = Column("Condition", ("condition",), is_text=True)
+    return Table(name, title, (head, *(c.column for c in columns)), tuple(rows), tuple(notes))
+
+
+def findings_table(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of claims: the paper's contrasts, ours, and the verdicts."""
+    columns = (
+        Column("Claim", ("claim",), is_text=True),
+        Column("Paper", ("paper",)),
+        Column("Here", ("here",)),
+        Column("95 % interval", ("low", "high")),
+        Column("Episodes", ("episodes",)),
+        Column("Verdict", ("verdict",), is_text=True),
+    )
+
+    def row(finding: Finding) -> Row:
+        claim, theirs, d = finding.claim, finding.published, finding.contrast
+        is_success = claim.measure == "success"
+        text, unit = (points, "points") if is_success else (later, "s")
+        first, *others = claim.weights
+        rows = RowSelection(first, is_success=None if is_success else True, versus=tuple(others))
+
+        def number(value: float | None, rows: RowSelection | None) -> Cell:
+            return Cell(NOTHING if value is None else f"{text(value)} {unit}", (value,), rows)
+
+        cells = (
+            Cell(claim.text, (claim.text,)),
+            number(theirs, None),
+            number(d.mean, rows),
+            Cell(NOTHING, (None, None))
+            if d.low is None or d.high is None
+            else Cell(_ends(text)(d.low, d.high), (d.low, d.high), rows),
+            Cell(str(d.n), (d.n,), rows),
+            Cell(finding.verdict, (finding.verdict,), is_strong=True),
+        )
+        return Row("Further claims" if theirs is None else "The paper's claims", cells)
+
+    notes = [
+        "Each is a difference between (means of) conditions, episode by episode, on seeds that all "
+        "of them have; of times, on episodes in which all of them succeeded. It holds, or does "
+        "not, where its interval lies on one side of the limit; otherwise the data cannot tell."
+    ]
+    if not statistics.has_many_train_seeds:
+        notes.append(
+            "With one training run of each condition, verdicts are about the policies that were "
+            "trained: the intervals leave out how much another run would differ."
+        )
+    rows = tuple(map(row, statistics.findings))
+    return Table("findings", "Claims and verdicts", columns, rows, tuple(notes))
+
+
+def success_table(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of success rates."""
+    task, limit = statistics.task, statistics.task.success_time_limit
+    columns = [
+        Statistic("Episodes", "episodes", str, "outcomes.episodes", ALL),
+        Statistic("Success", "success", percent, "success.rate", SUCCESSES, highest),
+        interval("95 % interval", percent, "success", ALL),
+        Statistic("Strict success", "strict_success", percent, "strict.rate", {"is_strict": True}),
+        interval("Its 95 % interval", percent, "strict", ALL, "strict_"),
+    ]
+    note = "95 % interval: Wilson."
+    if statistics.has_many_train_seeds:
+        note = (
+            "95 % interval: hierarchical bootstrap, training seeds, then the evaluation seeds that "
+            "they share; too narrow with two or three training seeds that differ much. A condition "
+            "with one training seed: Wilson, the training run being given."
+        )
+    notes = [note]
+    if task.strict_success:
+        notes.append(f"Strict success: {task.strict_success}.")
+    if limit is not None:
+        names = "in_time in_time_low in_time_high"
+        paths = "within_limit.rate within_limit.low within_limit.high"
+        columns.append(
+            Statistic(
+                f"In {limit:g} s", names, lambda rate, *_: percent(rate), paths, {"within": limit}
+            )
+        )
+        notes.append(f"In {limit:g} s: success within that time, {task.completion_time}.")
+    title = _titled(statistics.study.success_table, "Success rates")
+    return condition_table("success", title, statistics.conditions, columns, notes)
+
+
+def success_by_training_seed(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of success of every training run; without rows where none has several."""
+
+    def run(seed: int | None) -> Statistic:
+        def rate(c: ConditionStatistics) -> tuple[float | None, ...]:
+            found = c.success_by_seed.get(seed)
+            return (found.rate, found.low, found.high) if found else (None, None, None)
+
+        return Statistic(
+            f"Training seed {NOTHING if seed is None else seed}",
+            f"seed_{seed} seed_{seed}_low seed_{seed}_high",
+            lambda rate, low, high: f"{percent(rate)} ({100 * low:.1f} to {100 * high:.1f})",
+            rate,
+            {"train_seed": seed},
+        )
+
+    def spread(c: ConditionStatistics) -> tuple[float | None]:
+        rates = [run.rate for run in c.success_by_seed.values() if run.rate is not None]
+        return (max(rates) - min(rates) if len(rates) > 1 else None,)
+
+    columns = [
+        *map(run, statistics.train_seeds),
+        Statistic("Range, points", "range", lambda rate: f"{100 * rate:.1f}", spread, ALL),
+    ]
+    notes = (
+        "In brackets: 95 % interval (Wilson) over evaluation seeds, the training run being given.",
+        "Range: between the best and the worst run.",
+    )
+    conditions = statistics.conditions if statistics.has_many_train_seeds else ()
+    name, title = "success_by_training_seed", "Success by training seed"
+    return condition_table(name, title, conditions, columns, notes)
+
+
+def success_differences(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of every condition's success against the reference's, on common seeds."""
+    both = {"versus": (statistics.reference,)}
+    differing = {**both, "is_different": True}
+    comparison, difference = "success_difference", "success_difference.difference"
+    counts = f"{comparison}.wins {comparison}.losses"
+    columns = [
+        Statistic("Pairs", "pairs", str, f"{difference}.n", both),
+        Statistic("Difference", "difference", points, f"{difference}.mean", both),
+        interval("95 % interval", points, difference, both),
+        Statistic("Won : lost", "won lost", "{} : {}".format, counts, differing),
+        *p_values("McNemar", comparison, differing),
+    ]
+    many = statistics.has_many_train_seeds
+    notes = (
+        "Difference: rate minus that of the reference, in percentage points, on training and "
+        "evaluation seeds that both have.",
+        f"95 % interval: bootstrap over common seeds{', training seeds first' if many else ''}; "
+        "with no differing episode, Clopper and Pearson's bound for something not seen.",
+        "Won : lost: episodes in which only this condition, and only the reference, succeeded.",
+        f"McNemar's exact test, Holm-corrected over the rows; bold below {SIGNIFICANCE:.2f}."
+        + (
+            " It takes the training runs as given and their episodes as independent: where it and "
+            "the interval disagree, believe the interval."
+            if many
+            else ""
+        ),
+    )
+    title = f"Success against “{statistics.of(statistics.reference).condition.label}”"
+    others = [c for c in statistics.conditions if c.condition.name != statistics.reference]
+    return condition_table("success_differences", title, others, columns, notes)
+
+
+def success_beside_paper(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of the paper's counts beside ours, and whether they are compatible."""
+    trials = statistics.study.trials
+
+    def published(c: ConditionStatistics) -> tuple[float | None]:
+        return (c.published and c.published.successes / trials,)
+
+    columns = [
+        Statistic(
+            "Here",
+            "success episodes",
+            lambda rate, episodes: f"{percent(rate)} of {episodes}",
+            "success.rate outcomes.episodes",
+            ALL,
+        ),
+        Statistic(
+            f"Paper (n = {trials})",
+            "paper_success",
+            lambda rate: f"{100 * rate:.0f} %",
+            published,
+            None,
+        ),
+        *beside_paper("Fisher", "published_success", "", points, ALL),
+    ]
+    notes = (
+        "Compatible: Fisher's exact test on the two counts, Holm-corrected over the rows, gives at "
+        f"least {SIGNIFICANCE:.2f}. With {trials} trials in the paper that is a weak statement: "
+        "the interval (Newcombe) says which differences remain possible."
+        + (
+            " Episodes of all training runs are taken together, as if independent."
+            if statistics.has_many_train_seeds
+            else ""
+        ),
+    )
+    title = f"Success beside the paper's {statistics.study.success_table or 'results'}"
+    conditions = [c for c in statistics.conditions if c.published]
+    return condition_table("success_beside_paper", title, conditions, columns, notes)
+
+
+def times_table(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of completion times, and against the reference's on common seeds."""
+    reference, many = statistics.reference, statistics.has_many_train_seeds
+    both = {**SUCCESSES, "versus": (reference,)}
+    comparison, difference = "time_difference", "time_difference.difference"
+
+    def pairs(c: ConditionStatistics) -> tuple[int | None]:
+        return (None if c.condition.name == reference else c.time_difference.difference.n,)
+
+    def by_seed(c: ConditionStatistics) -> tuple[str]:
+        return (";".join("" if time is None else repr(time) for time in c.time_by_seed.values()),)
+
+    def seconds_by_seed(joined: str) -> str:
+        return " / ".join(seconds(float(t)) if t else NOTHING for t in joined.split(";"))
+
+    columns = [
+        Statistic("Successes", "successes", str, "time.n", SUCCESSES),
+        Statistic("Time, s", "time", seconds, "time.mean", SUCCESSES, lowest),
+        interval("95 % interval", seconds, "time", SUCCESSES),
+        Statistic("By training seed", "by_training_seed", seconds_by_seed, by_seed, SUCCESSES),
+        Statistic("Pairs", "pairs", str, pairs, both),
+        Statistic("Difference, s", "difference", later, f"{difference}.mean", both),
+        interval("Its 95 % interval", later, difference, both, "difference_"),
+        *p_values("Wilcoxon", comparison, both),
+    ]
+    if not many:
+        del columns[3]
+    notes = (
+        f"Time: mean {statistics.task.completion_time}, over successes only, with a bootstrap "
+        f"interval{' over training and evaluation seeds' if many else ''}.",
+        f"Difference: minus “{statistics.of(reference).condition.label}”, over episodes in which "
+        "both succeeded, so that a condition does not look fast for failing where it is slow; "
+        "Wilcoxon's signed-rank test, Holm-corrected over the rows, bold below "
+        f"{SIGNIFICANCE:.2f}.",
+    )
+    title = _titled(statistics.study.time_table, "Completion times")
+    return condition_table("completion_times", title, statistics.conditions, columns, notes)
+
+
+def times_beside_paper(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of the paper's mean completion times beside ours."""
+    study = statistics.study
+    columns = [
+        Statistic("Here, s", "time", seconds, "time.mean", SUCCESSES),
+        Statistic("Paper, s", "paper_time", "{:.1f}".format, "published.completion_time", None),
+        *beside_paper("t-test", "published_time", ", s", later, SUCCESSES),
+    ]
+    notes = (
+        "The paper gives no spread. It is taken to be ours, over as many successes as its "
+        f"{study.success_table or 'counts'} says; the interval and the test allow for its times "
+        f"being rounded to {2 * study.time_rounding:g} s.",
+        f"Compatible: the Holm-corrected p-value is at least {SIGNIFICANCE:.2f}.",
+    )
+    title = f"Completion times beside the paper's {study.time_table or 'results'}"
+    conditions = [c for c in statistics.conditions if c.published]
+    return condition_table("completion_times_beside_paper", title, conditions, columns, notes)
+
+
+def failures_table(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of failures by kind."""
+    titles = {kind: kind.replace("_", " ").capitalize() for kind in statistics.task.failures}
+
+    def count_of(kind: str) -> Statistic:
+        def count(c: ConditionStatistics) -> tuple[int]:
+            return (Counter(row.result.failure for row in c.rows)[kind],)
+
+        return Statistic(titles[kind], kind, str, count, {"failure": kind})
+
+    columns = [
+        Statistic("Episodes", "episodes", str, "outcomes.episodes", ALL),
+        Statistic("Success", "success", str, "success.count", SUCCESSES),
+        *map(count_of, titles),
+    ]
+    notes = [f"{titles[kind]}: {what}." for kind, what in statistics.task.failures.items()]
+    title = "How episodes ended"
+    return condition_table("failures", title, statistics.conditions, columns, notes)
+
+
+def _titled(table: str, title: str) -> str:
+    """Put the name of the paper's table before a title."""
+    return f"{table}: {title[0].lower()}{title[1:]}" if table else title
