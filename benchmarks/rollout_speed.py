@@ -10,7 +10,7 @@ Example: python benchmarks/rollout_speed.py --num_envs 1 8 --workers 0 2
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,10 +46,10 @@ class Options:
 class Still:
     """Holds the arm where it is, and looks at every image if there are any."""
 
-    def reset(self, slots: NDArray[np.intp], seeds: Sequence[int]) -> None:
+    def reset(self, slots: NDArray[np.intp]) -> None:
         """Nothing to forget."""
 
-    def needs_images(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def looks(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Always."""
         return np.ones(len(slots), np.bool_)
 
@@ -80,7 +80,7 @@ def policy_for(options: Options, num_envs: int) -> Policy:
     if options.checkpoint is None:
         return Still()
     from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
-    from robo_manip_baselines.policy.execution import PolicyRunner
+    from robo_manip_baselines.policy.execution import ChunkPolicy
     from robo_manip_baselines.training.device import choose_device
 
     checkpoint, device = read_checkpoint(options.checkpoint), choose_device("auto")
@@ -88,12 +88,12 @@ def policy_for(options: Options, num_envs: int) -> Policy:
         import torch
 
         torch.set_num_threads(1)  # as Rollout.py does
-    return PolicyRunner(
+    return ChunkPolicy(
         load_model(checkpoint, device),
         checkpoint.spec,
         checkpoint.normalization,
-        checkpoint.execution,
-        num_envs=num_envs,
+        checkpoint.acting,
+        slots=num_envs,
         device=device,
     )
 

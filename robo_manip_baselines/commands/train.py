@@ -39,18 +39,11 @@ class TrainOptions(Generic[Network]):
 
     run: tyro.conf.OmitArgPrefixes[TrainConfig[Network]]
     corruption: bool = True
-    """--no_corruption observes the truth, whatever other options are given."""
+    """--no_corruption turns all corruption of the observations off."""
     resume: bool = False
     """Continue the run in the run folder."""
     config: Path | None = None
     """YAML file of options, such as the config.yaml of a run; the command line overrides it."""
-
-    def to_config(self, preset: str) -> TrainConfig[Any]:
-        """Return the configuration."""
-        spec = self.run.spec
-        if not self.corruption:
-            spec = dataclasses.replace(spec, corruption=Corruption())
-        return dataclasses.replace(self.run, spec=spec, preset=preset)
 
 
 def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfig[Any]:
@@ -87,7 +80,12 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
         f"defaults below are those of {policy} with --preset {preset}. Presets of {policy}: "
         f"{', '.join(presets)}."
     )
-    return _parse(options, list(args), description).to_config(preset)
+    options = _parse(options, list(args), description)
+    config = dataclasses.replace(options.run, preset=preset)
+    if not options.corruption:
+        spec = dataclasses.replace(config.spec, corruption=Corruption())
+        config = dataclasses.replace(config, spec=spec)
+    return config
 
 
 def _parse(options: TrainOptions[Any], args: list[str], description: str) -> TrainOptions[Any]:
@@ -124,7 +122,7 @@ def _apply_yaml(
     file: Path, values: Mapping[str, Any], options: TrainOptions[Any]
 ) -> TrainOptions[Any]:
     """Parse a file's values as if they had been typed, so that they are checked the same way."""
-    known = [name for name in options.run.to_json() if name != "out"] + ["corruption"]
+    known = [*options.run.to_json(), "corruption"]
     args = [options.run.policy]
     try:
         for name, value in values.items():

@@ -120,8 +120,22 @@ class Corruption:
             require_choice("setting of the corruption", name, names)
         return cls(**values)
 
+    def override(self, changes: Mapping[str, Any]) -> Corruption:
+        """Return the same with other settings; what no longer fits the error is dropped.
+
+        Raises:
+            RequestError: a value is not valid.
+        """
+        start = self
+        if changes.get("error", self.error) not in MEASURED_ERRORS:
+            start = replace(self, error="none", error_stats=None, stats_sha256=None)
+            changes = {"error": self.error, **changes}
+        elif "error_stats" in changes:
+            start = replace(self, stats_sha256=None)
+        return replace(start, **changes)
+
     def __bool__(self) -> bool:
-        """Whether anything is corrupted."""
+        """Return whether anything is corrupted."""
         return bool(
             self.error != "none"
             or self.delay
@@ -172,7 +186,7 @@ class Corruption:
         return replace(self, stats_sha256=stats.sha256)
 
     def is_same_as(self, other: Corruption) -> bool:
-        """Whether both corrupt alike; statistics count by their digest, not by their path."""
+        """Return whether both corrupt alike; statistics count by digest, not by path."""
         if not (self or other):
             return True
         return replace(self, error_stats=None) == replace(other, error_stats=None)

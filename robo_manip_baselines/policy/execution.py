@@ -103,8 +103,7 @@ class ActionQueue:
     ) -> None:
         if not 1 <= n_action_steps <= chunk_size:
             raise RequestError(
-                f"n_action_steps (--execute) {n_action_steps}: must be 1 to {chunk_size}, the "
-                "chunk size"
+                f"n_action_steps {n_action_steps}: must be 1 to {chunk_size}, the chunk size"
             )
         self._queue = np.zeros((num_envs, n_action_steps, action_size), dtype=np.float32)
         self._used = np.full(num_envs, n_action_steps)
@@ -187,7 +186,7 @@ class PolicyRunner:
         self._model = fast.to(self._device)
         if spec.cameras:
             self._model = self._model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._spec, self._normalization = spec, normalization
+        self._has_images, self._normalization = bool(spec.cameras), normalization
         self._chunk_shape = model.chunk_size, len(normalization.action_mean)
         self._buffer = make_action_buffer(execution, num_envs, *self._chunk_shape)
         steps, state_size = model.n_obs_steps, len(normalization.state_mean)
@@ -223,7 +222,7 @@ class PolicyRunner:
 
         Args:
             vectors: (b, S) packed observations.
-            images: (b, N, H, W, 3); None without cameras. Rows that need none may hold anything.
+            images: (b, N, H, W, 3); rows that are not needed may hold anything.
             env_ids: (b,) the environments that they come from.
 
         Raises:
@@ -231,8 +230,8 @@ class PolicyRunner:
         """
         self._push(self._states, env_ids, self._normalization.normalize_state(vectors))
         if images is not None:
-            seen = np.flatnonzero(self.needs_images(env_ids))
-            self._push(self._images, env_ids[seen], images[seen])
+            needed = self.needs_images(env_ids)
+            self._push(self._images, env_ids[needed], images[needed])
         due = env_ids[self._buffer.steps_to_prediction(env_ids) == 0]
         size = len(self._state_tile)
         chunks = [self._predict(due[start : start + size]) for start in range(0, len(due), size)]
@@ -256,7 +255,7 @@ class PolicyRunner:
         self._state_tile[count:].zero_()
         self._state_tile.numpy()[:count] = self._states[env_ids]
         images = noise = None
-        if self._spec.cameras:
+        if self._has_images:
             self._image_tile[count:].zero_()
             self._image_tile.numpy()[:count] = self._images[env_ids]
             images = self._image_tile.to(self._device, non_blocking=True)

@@ -5,6 +5,7 @@ Nothing heavy is imported here, so that ``--help`` needs no PyTorch.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,30 @@ from robo_manip_baselines.runs.errors import RequestError, require_choice
 SAMPLERS = ("episode", "frame")
 PRECISIONS = ("auto", "fp32", "bf16")
 SCHEDULES = ("constant", "cosine")
+
+
+def require_at_least(least: float, config: Any, *names: str) -> None:
+    """Require attributes of a configuration to be None, or finite and ``least`` or more.
+
+    Raises:
+        RequestError: naming the first that is not.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and not least <= value < math.inf:
+            finite = ", and finite" if isinstance(value, float) else ""
+            raise RequestError(f"{name} {value}: must be {least} or more{finite}")
+
+
+def require_proportion(config: Any, *names: str) -> None:
+    """Require attributes of a configuration to be 0 or more and less than 1.
+
+    Raises:
+        RequestError: naming the first that is not.
+    """
+    for name in names:
+        if not 0.0 <= getattr(config, name) < 1.0:
+            raise RequestError(f"{name} {getattr(config, name)}: must be 0 or more, less than 1")
 
 
 @dataclass(frozen=True)
@@ -88,18 +113,12 @@ class TrainSettings:
         require_choice("schedule", self.schedule, SCHEDULES)
         if (self.epochs is None) == (self.steps is None):
             raise RequestError("give the budget as --epochs or as --steps, one of the two")
-        for name in ("batch_size", "epochs", "steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise RequestError(f"{name} {value}: must be 1 or more")
+        require_at_least(1, self, "batch_size", "epochs", "steps")
         if not self.learning_rate > 0.0:
             raise RequestError(f"learning_rate {self.learning_rate}: must be more than 0")
-        for name in ("weight_decay", "warmup_steps", "clip_norm", "state_noise", "clock_noise"):
-            if getattr(self, name) < 0:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more")
-        for name in ("validation_fraction", "ema_decay"):
-            if not 0.0 <= getattr(self, name) < 1.0:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more, less than 1")
+        require_at_least(0, self, "weight_decay", "warmup_steps", "clip_norm")
+        require_at_least(0, self, "state_noise", "clock_noise")
+        require_proportion(self, "validation_fraction", "ema_decay")
 
 
 @dataclass(frozen=True)
@@ -122,10 +141,7 @@ class ActionExecution:
     n_action_steps: int = 1
 
     def __post_init__(self) -> None:
-        if self.n_action_steps < 1:
-            raise RequestError(
-                f"n_action_steps (--execute) {self.n_action_steps}: must be 1 or more"
-            )
+        require_at_least(1, self, "n_action_steps")
 
     def to_json(self) -> dict[str, Any]:
         """Return all settings under the names that checkpoints have had since the first release."""

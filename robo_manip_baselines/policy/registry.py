@@ -10,10 +10,10 @@ Importing this module imports no network: classes are named, and loaded when the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
+from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 if TYPE_CHECKING:
@@ -88,12 +88,6 @@ def policy_presets(name: str) -> dict[str, PolicyPreset]:
         RequestError: there is no such policy.
     """
     return load_part(policy_entry(name).presets)
-
-
-def load_part(reference: str) -> Any:
-    """Import the object that ``module:name`` refers to."""
-    module, _, name = reference.partition(":")
-    return getattr(import_module(module), name)
 
 
 def make_model(name: str, config: Any, dims: PolicyDims) -> PolicyModel:

@@ -101,7 +101,7 @@ class BatchLoader:
         if depth < 0:
             raise ValueError(f"depth {depth}: must be 0 or more")
         self._sampler, self._model, self._seed = sampler, model, seed
-        self._state_noise = state_noise or StateNoise(demonstrations.spec)
+        self._state_noise = state_noise
         self._rank, self._world_size, self._depth = rank, world_size, depth
         self._offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sampler.lengths)])
         self._rows = demonstrations.rows(episodes)  # of the images, for each of the R steps
@@ -151,7 +151,9 @@ class BatchLoader:
         chunks, is_pad = chunk_rows(self._offsets, episodes, starts, self._model.chunk_size)
         windows = window_rows(self._offsets, episodes, starts, n_obs_steps)
         noise = step_noise(self._seed, "noise", step, count, self._model.noise_size)
-        state_noise = self._state_noise.draw(self._seed, step, count * n_obs_steps)
+        state_noise: Tensor | None = None
+        if self._state_noise:
+            state_noise = self._state_noise.draw(self._seed, step, count * n_obs_steps)
         part = part_of(count, self._rank, self._world_size)
         if state_noise is not None:
             state_noise = state_noise.view(count, n_obs_steps, -1)[part]

@@ -18,7 +18,7 @@ import yaml
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.spec import parse_image_size
-from robo_manip_baselines.policy.presets import ActionExecution, TrainSettings
+from robo_manip_baselines.policy.presets import ActionExecution, TrainSettings, require_at_least
 from robo_manip_baselines.policy.registry import policy_presets
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_text
@@ -34,18 +34,15 @@ RUNTIME_OPTIONS = frozenset(
 )
 """Options that may change when a run is resumed: they do not decide the weights."""
 
+_PARTS = ("network", "training", "spec")
+"""Attributes of the configuration whose fields are options."""
+
 _CORRUPTION = {
-    "error": "error",
-    "error_stats": "error_stats",
-    "delay": "delay",
-    "face_dropout": "face_dropout",
-    "face_dropout_length": "face_dropout_length",
-    "detector_rate": "detector_rate",
-    "corruption_seed": "seed",
+    "corruption_seed" if item.name == "seed" else item.name: item.name
+    for item in fields(Corruption)
+    if item.name != "stats_sha256"
 }
 """Option -> attribute of `Corruption`."""
-
-_OBSERVATION = ("obs", "horizon", "cameras", "image_size", "object_pose", "arms")
 
 
 @dataclass(frozen=True)
@@ -94,11 +91,8 @@ class TrainConfig(Generic[Network]):
     def __post_init__(self) -> None:
         require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
         task_entry(self.env)
-        for name in ("log_every", "validate_every", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more steps")
-        if self.seed < 0:
-            raise RequestError(f"seed {self.seed}: must be 0 or more")
+        require_at_least(1, self, "log_every", "validate_every", "checkpoint_every")
+        require_at_least(0, self, "seed")
 
     @classmethod
     def from_preset(cls, policy: str, preset: str, **changes: Any) -> TrainConfig[Any]:
@@ -123,11 +117,8 @@ class TrainConfig(Generic[Network]):
         """Run folder."""
         if self.out is not None:
             return self.out
-        spec = self.spec
-        parts = [self.policy.lower(), spec.obs]
-        parts += [f"h{spec.horizon}"] if spec.obs == "current_pred" else []
-        parts += [spec.corruption.label] if spec.corruption else []
-        return Path("runs") / "_".join([*parts, self.preset, f"seed{self.seed}"])
+        name = f"{self.policy.lower()}_{self.spec.name}_{self.preset}_seed{self.seed}"
+        return Path("runs") / name
 
     @property
     def demonstrations(self) -> Path:
@@ -141,20 +132,12 @@ class TrainConfig(Generic[Network]):
 
     def to_json(self) -> dict[str, Any]:
         """Return all settings by the names of their options, made of plain values."""
-        spec, corruption = self.spec, self.spec.corruption or None
-        values = {
-            **{
-                item.name: getattr(self, item.name)
-                for item in fields(self)
-                if item.name not in ("network", "training", "spec")
-            },
-            **dataclasses.asdict(self.network),  # pyright: ignore[reportArgumentType]
-            **dataclasses.asdict(self.training),
-            **{name: getattr(spec, name) for name in _OBSERVATION},
-            "image_size": f"{spec.image_size[0]}x{spec.image_size[1]}",
-            **{name: getattr(corruption, of, None) for name, of in _CORRUPTION.items()},
-        }
-        values["error"] = values["error"] or "none"
+        values = {name: value for name, value in vars(self).items() if name not in _PARTS}
+        for part in _PARTS:
+            values |= vars(getattr(self, part))
+        corruption = values.pop("corruption")
+        values |= {name: getattr(corruption, of) for name, of in _CORRUPTION.items()}
+        values["image_size"] = "{}x{}".format(*self.spec.image_size)
         return {name: _plain(value) for name, value in values.items()}
 
     @classmethod
@@ -172,34 +155,21 @@ class TrainConfig(Generic[Network]):
             name: tuple(value) if isinstance(value, list) else value
             for name, value in values.items()
         }
+        for name in ("dataset", "out"):
+            given[name] = Path(given[name]) if given.get(name) else None
+        if "image_size" in given:
+            given["image_size"] = parse_image_size(given["image_size"])
+        corruption = {of: given[name] for name, of in _CORRUPTION.items() if name in given}
+        is_on = given.pop("corruption", True) is not False  # --no_corruption of older releases
+        chosen = {of: value for of, value in corruption.items() if value is not None and is_on}
+        given["corruption"] = Corruption(**chosen)
 
         def changed(part: Any) -> Any:
             names = {item.name for item in fields(part)} & given.keys()
             return dataclasses.replace(part, **{name: given[name] for name in names})
 
-        observation = {name: given[name] for name in _OBSERVATION if name in given}
-        if "image_size" in observation:
-            observation["image_size"] = parse_image_size(observation["image_size"])
-        if "cameras" in observation:
-            observation["cameras"] = tuple(c for c in observation["cameras"] if c != "none")
-        corruption = {
-            attribute: given[name]
-            for name, attribute in _CORRUPTION.items()
-            if given.get(name) is not None
-        }
-        if given.get("corruption") is False:
-            corruption = {}
-        spec = dataclasses.replace(default.spec, **observation, corruption=Corruption(**corruption))
-        paths = {name: Path(given[name]) for name in ("dataset", "out") if given.get(name)}
-        given = {**given, **paths}
-        own = {item.name for item in fields(cls)} & given.keys()
-        return dataclasses.replace(
-            default,
-            **{name: given[name] for name in own},
-            network=changed(default.network),
-            training=changed(default.training),
-            spec=spec,
-        )
+        given |= {part: changed(getattr(default, part)) for part in _PARTS}
+        return changed(default)
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -10,9 +10,8 @@ import os
 import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 import numpy as np
@@ -32,7 +31,7 @@ UNKNOWN_MEMORY = 4 * 2**30
 """Bytes assumed to be free where the system does not report it."""
 
 
-class ImageStore:
+class ImageStore(AbstractContextManager["ImageStore"]):
     """Images of steps, in the order of ``spec.cameras``, at the size ``spec.image_size``.
 
     Images that fit into ``memory_budget`` are decoded once and held. Otherwise each is read from
@@ -84,15 +83,7 @@ class ImageStore:
                 self.close()
                 raise
 
-    def __enter__(self) -> ImageStore:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def images(self, rows: NDArray[np.int64], out: Images | None = None) -> Images:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from robo_manip_baselines.observation import ObservationSpec, ObservedNames
-from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings
+from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings, require_at_least
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.seeds import derive_seed
 
@@ -46,10 +46,8 @@ class ExampleSampler:
         self.sampler = require_choice("sampler", sampler, SAMPLERS)
         self.batch_size = batch_size
         self.seed = seed
-        if batch_size < 1:
-            raise RequestError(f"batch_size {batch_size}: must be 1 or more")
-        if seed < 0:
-            raise RequestError(f"seed {seed}: must be 0 or more")
+        require_at_least(1, self, "batch_size")
+        require_at_least(0, self, "seed")
         if self.lengths.ndim != 1 or not self.lengths.size or self.lengths.min() < 1:
             raise RequestError("training needs at least one episode, each of at least one step")
         by_episode = sampler == "episode"
@@ -143,23 +141,18 @@ class StateNoise:
 
     Args:
         spec: of the observations.
+        names: of the task's target and objects.
         robot: ``TrainSettings.state_noise``.
         clock: ``TrainSettings.clock_noise``.
-        observed: names of the task's target and objects.
     """
 
     def __init__(
-        self,
-        spec: ObservationSpec,
-        robot: float = 0.0,
-        clock: float = 0.0,
-        observed: ObservedNames | None = None,
+        self, spec: ObservationSpec, names: ObservedNames, robot: float = 0.0, clock: float = 0.0
     ) -> None:
-        observed = observed or ObservedNames()
-        names = spec.vector_names(observed)
-        self._size = len(names)
-        self._robot_size = len(spec.components(observed)["state"])  # they come first
-        self._times = [i for i, name in enumerate(names) if name.startswith("t_")]
+        elements = spec.vector_names(names)
+        self._size = len(elements)
+        self._robot_size = len(spec.components(names)["state"])  # they come first
+        self._times = [i for i, name in enumerate(elements) if name.startswith("t_")]
         self._robot, self._clock = robot, clock
 
     def draw(self, seed: int, step: int, count: int) -> Tensor | None:

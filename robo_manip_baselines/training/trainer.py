@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
@@ -90,9 +89,11 @@ def _train(
         else:
             processes.wait()  # until every process has seen the folder as it was
             log = stack.enter_context(setup.open_log(start)) if processes.is_main else None
-            images = _open_images(setup.demonstrations)
-            if images:
-                stack.enter_context(images)
+            images = None
+            if setup.dims.cameras:
+                # Half of the free memory, which the processes of one machine share.
+                budget = free_memory() // 2 // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+                images = stack.enter_context(ImageStore(setup.demonstrations, memory_budget=budget))
             trainer = Trainer(setup, start, device, processes, images=images, log=log)
             stop = stack.enter_context(StopRequest(once_more=processes.world_size == 1))
             if trainer.run(stop) < setup.total_steps:
@@ -148,7 +149,10 @@ class Trainer:
             log_every=config.log_every,
         )
         self._timer = StepTimer(device)
-        self._compute_loss = _loss_module(model, settings.compile, processes)
+        loss: nn.Module = _LossModule(model)
+        if processes.world_size > 1:
+            loss = DistributedDataParallel(loss, gradient_as_bucket_view=True)
+        self._compute_loss = torch.compile(loss) if settings.compile else loss
         self.loader = BatchLoader(
             *(given, setup.normalization, given.indices(setup.split.train), setup.sampler, model),
             seed=config.seed,
@@ -156,8 +160,9 @@ class Trainer:
             rank=processes.rank,
             world_size=processes.world_size,
             state_noise=StateNoise(
-                *(given.spec, settings.state_noise, settings.clock_noise),
-                observed=task_entry(setup.config.env).names,
+                *(given.spec, task_entry(config.env).names),
+                robot=settings.state_noise,
+                clock=settings.clock_noise,
             ),
             images=images,
         )
@@ -296,21 +301,6 @@ class _LossModule(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss and its parts."""
         return self.model.loss(batch)
-
-
-def _loss_module(model: PolicyModel, is_compiled: bool, processes: Processes) -> Any:
-    loss: nn.Module = _LossModule(model)
-    if processes.world_size > 1:
-        loss = DistributedDataParallel(loss, gradient_as_bucket_view=True)
-    return torch.compile(loss) if is_compiled else loss
-
-
-def _open_images(demonstrations: Demonstrations) -> ImageStore | None:
-    if not demonstrations.spec.cameras:
-        return None
-    # Half of what is free is the store's own measure; the processes of one machine share it.
-    share = free_memory() // 2 // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    return ImageStore(demonstrations, memory_budget=share)
 
 
 def _draw_curves(config: TrainConfig[Any]) -> None:

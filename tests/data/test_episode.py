@@ -24,9 +24,12 @@ from robo_manip_baselines.data.example import (
     make_frames,
     make_images,
 )
-from robo_manip_baselines.data.schema import ATTRIBUTES, FIELDS
+from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.data.verify import verify_file
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.runs.errors import RequestError
+
+SCHEMA = EpisodeSchema.of(task_entry("FeedingEnv"))
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "png", "raw"])
@@ -176,13 +179,13 @@ def test_failure_while_writing_leaves_what_was_there(
 def test_units_stand_beside_the_numbers(tmp_path: Path) -> None:
     path = write_episode(tmp_path / "a.hdf5", make_arrays(), {}, make_attributes())
     with h5py.File(path) as file:
-        for field in FIELDS:
+        for field in SCHEMA.fields:
             if field.since > 1:
                 continue
             assert file[field.name].attrs["unit"].decode() == field.unit
             assert file[field.name].attrs["frame"].decode() == field.frame
         assert file["mouth_position"].attrs["unit"] == b"m"
-        assert set(file.attrs) == {item.name for item in ATTRIBUTES}
+        assert set(file.attrs) == {item.name for item in SCHEMA.attributes}
         assert json.loads(file.attrs["versions"])["mujoco"] == "3.17.0"
 
 
@@ -217,7 +220,7 @@ def _other_hdf5(path: Path) -> None:
 def _future(path: Path) -> None:
     write_episode(path, make_arrays(), {}, make_attributes())
     with h5py.File(path, "a") as file:
-        file.attrs["schema_version"] = np.int64(3)
+        file.attrs["schema_version"] = np.int64(4)
 
 
 @pytest.mark.parametrize(
@@ -229,7 +232,7 @@ def _future(path: Path) -> None:
         (_empty, "is no HDF5 file"),
         (_truncated, "is no HDF5 file, or a damaged one: .*truncated"),
         (_other_hdf5, "is no episode: schema None"),
-        (_future, "schema version 3; this release reads 1, 2"),
+        (_future, "schema version 4; this release reads 1, 2, 3"),
     ],
 )
 def test_errors_name_the_file_and_why(tmp_path: Path, make: object, why: str) -> None:

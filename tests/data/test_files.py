@@ -16,7 +16,7 @@ from robo_manip_baselines.data import (
     episode_path,
     finished_seeds,
     list_episodes,
-    remove_temporaries,
+    remove_partial_episodes,
 )
 from robo_manip_baselines.data.files import seed_of
 from robo_manip_baselines.data.verify import verify_dataset
@@ -81,7 +81,7 @@ def test_only_leftovers_of_dead_processes_are_removed(tmp_path: Path) -> None:
     failed.parent.mkdir()
     for path in (dead, alive, failed, other):
         path.touch()
-    assert remove_temporaries(tmp_path) == [dead, failed]
+    assert remove_partial_episodes(tmp_path) == [dead, failed]
     assert sorted(path for path in tmp_path.rglob("*") if path.is_file()) == [alive, other]
 
 
@@ -100,14 +100,14 @@ import sys
 from robo_manip_baselines.data import *
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 folder = sys.argv[1]
-remove_temporaries(folder)
+remove_partial_episodes(folder)
 images = make_images(40)
-print("ready", flush=True)
 for seed in range(int(sys.argv[2])):
     if seed not in finished_seeds(folder):
         path = episode_path(folder, seed, success=seed % 5 != 4)
         attributes = make_attributes(seed) | {"is_success": seed % 5 != 4}
         write_episode(path, make_arrays(40, seed), images, attributes)
+        print("written", flush=True)
 """
 
 
@@ -119,7 +119,7 @@ def test_killed_run_leaves_whole_files_and_is_carried_on(tmp_path: Path) -> None
         with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
             assert process.stdout is not None
             process.stdout.readline()
-            time.sleep(rng.uniform(0.01, 0.15))  # into the writing, at no moment in particular
+            time.sleep(rng.uniform(0.01, 0.15))  # into the writing of a later one, at any moment
             process.send_signal(signal.SIGKILL)
         now = finished_seeds(tmp_path)
         assert kept <= now
@@ -130,7 +130,8 @@ def test_killed_run_leaves_whole_files_and_is_carried_on(tmp_path: Path) -> None
 
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.hdf5")}
     number = max(kept) + 5
-    subprocess.run([sys.executable, "-c", _COLLECT, str(tmp_path), str(number)], check=True)
+    command = [sys.executable, "-c", _COLLECT, str(tmp_path), str(number)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     assert finished_seeds(tmp_path) == set(range(number))
     assert verify_dataset(tmp_path) == []  # not even a leftover
     assert {path: path.stat().st_mtime_ns for path in times} == times

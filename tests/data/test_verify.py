@@ -22,9 +22,12 @@ from robo_manip_baselines.data.example import (
     make_frames,
     make_images,
 )
-from robo_manip_baselines.data.schema import ATTRIBUTES, content_digest, fields_of, loaded_attribute
+from robo_manip_baselines.data.schema import EpisodeSchema, content_digest, loaded_attribute
 from robo_manip_baselines.data.verify import damage_summary, verify_dataset, verify_file
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.runs.errors import RequestError
+
+SCHEMA = EpisodeSchema.of(task_entry("FeedingEnv"))
 
 pytestmark = pytest.mark.long
 
@@ -39,10 +42,10 @@ def write(
 
 def seal(file: h5py.File) -> None:
     """Make the digest right again, so that only the damage itself can be found."""
-    arrays = {name: file[name][()] for name in fields_of(int(file.attrs["schema_version"]))}
+    arrays = {name: file[name][()] for name in SCHEMA.fields_of(int(file.attrs["schema_version"]))}
     checksums = {name: group["checksum"][()] for name, group in file["images"].items()}
-    attributes = {item.name: loaded_attribute(item, file.attrs[item.name]) for item in ATTRIBUTES}
-    file.attrs["content_sha256"] = content_digest(arrays, checksums, attributes)
+    attributes = {i.name: loaded_attribute(i, file.attrs[i.name]) for i in SCHEMA.attributes}
+    file.attrs["content_sha256"] = content_digest(SCHEMA, arrays, checksums, attributes)
 
 
 def put_frame(file: h5py.File, camera: str, step: int, data: np.ndarray) -> None:
@@ -129,7 +132,7 @@ DAMAGE: list[tuple[Callable[[h5py.File], Any], str]] = [
     (_attribute("expert", "another"), "do not fit 'content_sha256'"),
     (lambda file: file["qpos"].__setitem__((0, 0), 0.5), "do not fit 'content_sha256'"),
     (swap_frame, "frame 4 of 'top' cannot be read: its checksum is wrong"),
-    (_frame(np.frombuffer(b"no picture", np.uint8)), "frame 4 of 'top' cannot be decoded"),
+    (_frame(np.frombuffer(b"no image", np.uint8)), "frame 4 of 'top' cannot be decoded"),
     (_frame(make_images()["top"][4][:0]), "frame 4 of 'top' cannot be decoded"),
     (_frame(encode_image(make_frames(size=(24, 30))[0])), "frame 4 of 'top' is (24, 30, 3)"),
 ]
@@ -206,6 +209,7 @@ def test_unknown_keys_are_warnings(tmp_path: Path) -> None:
         ("action_names", list("abcdefg")),
     ],
 )
+@pytest.mark.usefixtures("other_task")
 def test_mixed_folder(tmp_path: Path, name: str, value: object) -> None:
     for seed in range(3):
         write(tmp_path, seed)

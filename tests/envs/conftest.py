@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, add_cube, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import (FINGER_OPEN, HOME_QPOS)
-from robo_manip_baselines.observation.spec import ARM_JOINTS
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import FaceModel, add_face
+from robo_manip_baselines.observation.spec import ARM_JOINTS
 
 
 @dataclass(frozen=True)

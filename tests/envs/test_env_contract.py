@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +12,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import robo_manip_baselines  # noqa: F401  (registers the environments)
-from robo_manip_baselines.envs.mujoco.tasks.registry import ENVS, env_id, make_env
+from robo_manip_baselines.data.schema import EpisodeSchema
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry, task_names
+from robo_manip_baselines.observation import MAX_HORIZON
 from robo_manip_baselines.runs.errors import RequestError
 
 STEPS = 40
@@ -22,14 +27,14 @@ ADVICE = "ignore:.*For Box action spaces, we recommend using a symmetric and nor
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "baseline": {"obs": "baseline"},
-    "current": {"obs": "current", "object_pose": True},
-    "current_pred": {"obs": "current_pred", "horizon": 5, "object_pose": True},
+    "current": {"obs": "current"},
+    "current_pred": {"obs": "current_pred", "horizon": 5},
     "both arms": {"obs": "current_pred", "horizon": 1, "arms": "both"},
     "after lift": {"obs": "current", "face_motion": "after_lift"},
 }
 
 
-@pytest.fixture(params=sorted(ENVS))
+@pytest.fixture(params=sorted(task_names()))
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -86,12 +91,12 @@ def test_no_element_of_an_observation_is_constant(env: gymnasium.Env[Any, Any]) 
     for key in seen[0][0]:
         values = np.stack([observation[key] for run in seen for observation in run])
         constant = np.flatnonzero(np.ptp(values, axis=0) == 0.0)
-        names = env.unwrapped.observation_spec.components()[key]
+        names = env.unwrapped.observation_spec.components(env.unwrapped.task.names)[key]
         assert not len(constant), f"{key}: {[names[i] for i in constant]}"
 
 
 def test_every_component_is_named(env: gymnasium.Env[Any, Any]) -> None:
-    components = env.unwrapped.observation_spec.components()
+    components = env.unwrapped.observation_spec.components(env.unwrapped.task.names)
     spaces = env.observation_space.spaces
     assert {key: (len(names),) for key, names in components.items()} == {
         key: space.shape for key, space in spaces.items()
@@ -102,42 +107,73 @@ def test_every_component_is_named(env: gymnasium.Env[Any, Any]) -> None:
 
 def test_the_start_is_really_random(env: gymnasium.Env[Any, Any]) -> None:
     world = env.unwrapped
-    cubes, mouths, segments = [], [], set()
+    objects, mouths, segments = [], [], set()
     for seed in range(20):
         env.reset(seed=seed)
-        cubes.append(world.object_position())
+        objects.append(world.object_position())
         mouths.append(world.mouth_track[0])
         segments.add(world.segment.index)
     # Of a uniform spread of 0.1 m, twenty draws cover less than half with odds below 1e-5.
-    assert (np.ptp(cubes, axis=0)[:2] > 0.05).all()
+    assert (np.ptp(objects, axis=0)[..., :2] > 0.05).all()
     assert (np.ptp(mouths, axis=0) > 0.05).all()
     assert len(segments) > 15
 
 
-def test_info_has_the_promised_keys_and_types(env: gymnasium.Env[Any, Any]) -> None:
+def test_info_has_what_every_task_promises(env: gymnasium.Env[Any, Any]) -> None:
+    world = env.unwrapped
     _, info = env.reset(seed=0)
     _, _, _, _, later = env.step(env.action_space.sample())
-    for told in (info, later):
-        assert isinstance(told["is_success"], bool)
-        assert isinstance(told["is_success_strict"], bool)
-        for name in ("mouth_position", "gripper_position", "cube_offset"):
-            assert told[name].shape == (3,)
-        assert told["phase"] == "reach"
-        assert told["time_since_lift"] is None
-        assert told["completion_time"] is None
-        assert told["face_force"] == 0.0
+    for given in (info, later):
+        assert given["is_success"] is False
+        assert given["is_success_strict"] is False
+        assert given["completion_time"] is None
+        assert given["phase"] in world.phase_names
 
 
-def test_truncates_after_twelve_seconds(name: str) -> None:
+def test_an_entry_describes_its_environment(name: str) -> None:
+    task = task_entry(name)
+    with contextlib.closing(
+        make_env(name, cameras=(), object_pose=bool(task.names.objects))
+    ) as env:
+        world = world_of(env)
+        observation, info = env.reset(seed=0)
+        assert env.spec is not None
+        assert (env.spec.id, env.spec.max_episode_steps) == (task.env_id, task.max_episode_steps)
+        assert world.task is task
+        assert world.object_position().shape == (len(task.names.objects), 3)
+        assert world.target_track().shape == (MAX_HORIZON + 1, 3)
+        schema = EpisodeSchema.of(task)
+        row = {**world.episode_row(), "action": env.action_space.sample()}
+        held = set(schema.by_name) - {"is_success", "is_success_strict"}
+        optional = {field.name for field in schema.fields if field.is_optional}
+        assert held - optional <= set(row) <= held
+        given = {item.name for item in task.attributes}
+        assert given <= set(world.start_attributes())
+        np.testing.assert_array_equal(
+            observation["state"], world.vector[: len(observation["state"])]
+        )
+        metrics = task.make_metrics()
+        metrics.update(info)
+        failure, columns = metrics.result(info)
+        assert failure in task.failures
+        assert set(columns) == {column.name for column in task.columns}
+        for expert in task.experts:
+            actor = task.make_expert(expert, world)
+            actor.reset()
+            assert env.action_space.contains(actor.act())
+
+
+def test_truncates_at_the_time_limit(name: str) -> None:
     env = make_env(name, cameras=())
     env.reset(seed=0)
     world = env.unwrapped
     stay = np.array([*world.data.ctrl[world.model.actuator("right/waist").id :]][:7], np.float32)
-    for step in range(1, 601):
+    limit = task_entry(name).max_episode_steps
+    for step in range(1, limit + 1):
         _, _, terminated, truncated, _ = env.step(stay)
         assert not terminated
-        assert truncated is (step == 600)
-    assert world.time == pytest.approx(12.0)
+        assert truncated is (step == limit)
+    assert world.time == pytest.approx(limit * CONTROL_PERIOD)
     env.close()
 
 
@@ -155,7 +191,9 @@ def test_actions_are_bounded_and_checked(env: gymnasium.Env[Any, Any]) -> None:
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_vector_environments_give_what_single_ones_give(name: str, mode: str) -> None:
     options: dict[str, Any] = {"cameras": (), "obs": "current"}
-    vector = gymnasium.make_vec(env_id(name), num_envs=2, vectorization_mode=mode, **options)
+    vector = gymnasium.make_vec(
+        task_entry(name).env_id, num_envs=2, vectorization_mode=mode, **options
+    )
     single = make_env(name, **options)
     together, _ = vector.reset(seed=[7, 8])
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""What FeedingEnv makes of the simulator's state."""
+"""FeedingEnv: contacts, phases, info and the face."""
 
 from __future__ import annotations
 
@@ -23,6 +23,17 @@ def world() -> Iterator[FeedingEnv]:
     env.unwrapped.reset(seed=2)
     yield env.unwrapped
     env.close()
+
+
+def test_info_at_the_start(world: FeedingEnv) -> None:
+    _, info = world.reset(seed=0)
+    _, _, _, _, later = world.step(STAY_OPEN)
+    for given in (info, later):
+        for name in ("mouth_position", "gripper_position", "cube_offset"):
+            assert given[name].shape == (3,)
+        assert given["phase"] == "reach"
+        assert given["time_since_lift"] is None
+        assert given["face_force"] == 0.0
 
 
 def put_cube_between_fingers(world: FeedingEnv, aside: float, finger: float) -> None:
@@ -70,7 +81,7 @@ def test_the_inside_of_the_mouth_starts_and_stays_where_the_mouth_is(world: Feed
         np.testing.assert_allclose(cavity.xpos, world.mouth_track[0], atol=0.5 * 0.004 * 2)
 
 
-def test_force_on_the_face_is_told(world: FeedingEnv) -> None:
+def test_force_on_the_face_is_in_the_info(world: FeedingEnv) -> None:
     """A head that comes too near is felt, and is not felt from afar."""
     _, _, _, _, info = world.step(STAY_OPEN)
     assert info["face_force"] == 0.0

@@ -12,9 +12,9 @@ from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
     CLEAR_DISTANCE,
     LIFT_HEIGHT,
     LIP_DEPTH,
-    Facts,
+    FeedingProgress,
     Phase,
-    Progress,
+    StepMeasurements,
     from_mouth,
     is_at_mouth,
     is_inside_mouth,
@@ -83,7 +83,7 @@ def test_inside_the_opening(
     assert is_inside_mouth(found, 0.025, 0.015) is expected
 
 
-NOTHING = Facts(
+NOTHING = StepMeasurements(
     time=0.0,
     is_held=False,
     is_touched=False,
@@ -100,9 +100,9 @@ LET_GO = replace(AT_MOUTH, is_held=False, is_touched=False, is_inside_mouth=True
 CLEAR = replace(LET_GO, is_at_mouth=False, gripper_distance=CLEAR_DISTANCE)
 
 
-def play(*facts: Facts) -> Progress:
+def play(*facts: StepMeasurements) -> FeedingProgress:
     """Advance through facts, one control step each."""
-    progress = Progress()
+    progress = FeedingProgress()
     for step, fact in enumerate(facts):
         progress = progress.advance(replace(fact, time=0.02 * (step + 1)))
     return progress
@@ -134,7 +134,7 @@ def test_a_perfect_episode() -> None:
         ((HELD, LIFTED, LET_GO, HELD), Phase.RELEASE),
     ],
 )
-def test_phases(facts: tuple[Facts, ...], phase: Phase) -> None:
+def test_phases(facts: tuple[StepMeasurements, ...], phase: Phase) -> None:
     assert play(*facts).phase is phase
 
 
@@ -176,15 +176,17 @@ def test_phases(facts: tuple[Facts, ...], phase: Phase) -> None:
         ("it rolls out after the release", (LIFTED, AT_MOUTH, LET_GO, NOTHING), True, True),
     ],
 )
-def test_outcomes(name: str, facts: tuple[Facts, ...], success: bool, strict: bool) -> None:
+def test_outcomes(
+    name: str, facts: tuple[StepMeasurements, ...], success: bool, strict: bool
+) -> None:
     progress = play(*facts)
     assert progress.is_success is success, name
     assert progress.is_success_strict is strict, name
 
 
 def test_there_are_no_times_before_the_events() -> None:
-    assert Progress().completion_time is None
-    assert Progress().time_since_lift(3.0) is None
+    assert FeedingProgress().completion_time is None
+    assert FeedingProgress().time_since_lift(3.0) is None
     assert play(LIFTED).completion_time is None
 
 

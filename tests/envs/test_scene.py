@@ -15,8 +15,8 @@ from robo_manip_baselines.envs.mujoco.cell.scene import (
     look_at,
     require_mujoco,
 )
-from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.runs.errors import RequestError
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from robo_manip_baselines.envs.mujoco.cell import vx300s
 from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, build_cell
+from robo_manip_baselines.observation import ARM_JOINTS
 
 PI = math.pi
 FULL_TURN = PI - 0.00001
@@ -156,7 +157,7 @@ def test_gripper_pose_agrees_with_the_published_chain(model: mujoco.MjModel, arm
 
 
 def test_joint_limits_are_the_published_ones(model: mujoco.MjModel) -> None:
-    assert tuple(joint for joint, *_ in CHAIN) == vx300s.ARM_JOINTS
+    assert tuple(joint for joint, *_ in CHAIN) == ARM_JOINTS
     for arm in ARM_BASES:
         for joint, _, _, limits in CHAIN:
             assert vx300s.JOINT_LIMITS[joint] == pytest.approx(limits, abs=1e-12)
@@ -173,7 +174,7 @@ def test_joint_limits_are_the_published_ones(model: mujoco.MjModel) -> None:
 
 
 def test_home_pose_is_within_the_limits() -> None:
-    for angle, joint in zip(vx300s.HOME_QPOS, vx300s.ARM_JOINTS, strict=True):
+    for angle, joint in zip(vx300s.HOME_QPOS, ARM_JOINTS, strict=True):
         low, high = vx300s.JOINT_LIMITS[joint]
         assert low < angle < high
 

@@ -17,7 +17,7 @@ from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
-from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims, TrainSettings
+from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
 from robo_manip_baselines.rollout.workers import Task
 
 SPEC = ObservationSpec(obs="current_pred", cameras=(), object_pose=True)
@@ -42,8 +42,8 @@ def make_checkpoint(task: Task) -> MakeCheckpoint:
 
     def make(folder: Path, **changes: object) -> Checkpoint:
         config = MlpConfig(chunk_size=6, hidden_size=16, hidden_layers=1)
-        dims = PolicyDims(task.vector_size, task.action_size, 0, SPEC.image_size)
-        model = MlpModel(config, dims)
+        sizes = Sizes(task.vector_size, task.action_size, 0, SPEC.image_size)
+        model = MlpModel(config, sizes)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             for parameter in model.parameters():
@@ -51,15 +51,15 @@ def make_checkpoint(task: Task) -> MakeCheckpoint:
         facts = {
             "policy": "Mlp",
             "config": config,
-            "dims": dims,
+            "sizes": sizes,
             "spec": SPEC,
             "env": "FeedingEnv",
-            "execution": ActionExecution(),
+            "acting": Acting(),
             "normalization": Normalization(
-                np.zeros(dims.state, np.float32),
-                np.ones(dims.state, np.float32),
+                np.zeros(sizes.state, np.float32),
+                np.ones(sizes.state, np.float32),
                 middle,
-                np.full(dims.action, 0.05, np.float32),
+                np.full(sizes.action, 0.05, np.float32),
             ),
             "action_names": names,
             "control_period": 0.02,

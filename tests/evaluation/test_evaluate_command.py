@@ -19,8 +19,8 @@ from robo_manip_baselines.commands.rollout import EXAMPLE, PolicyOptions, Rollou
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import Checkpoint
-from robo_manip_baselines.policy.presets import ActionExecution
-from robo_manip_baselines.rollout.evaluation import arm_name, choose_execution, plan, run_name
+from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.rollout.evaluation import arm_name, choose_acting, plan, run_name
 from robo_manip_baselines.rollout.results import read_results
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
@@ -148,8 +148,8 @@ def children_of_group(group: int) -> list[int]:
         ("--image_size 24x32", "trained with image_size 480x640, not 24x32"),
         ("--checkpoint nowhere", "checkpoint 'nowhere' does not exist"),
         ("--temporal_ensemble --execute 2", "--temporal_ensemble and --execute: say one"),
-        ("--execute 0", "(--execute) 0"),
-        ("--execute 7", r"\(--execute\) 7: must be 1 to 6"),
+        ("--execute 0", "execute 0"),
+        ("--execute 7", "execute 7: must be 1 to 6"),
         ("--num_envs 0", "num_envs 0"),
         ("--workers -1", "workers -1"),
         ("--video -1", "video -1"),
@@ -225,10 +225,10 @@ def test_seeds_of_demonstrations_are_pointed_out(
 
 
 def test_the_checkpoint_says_how_to_act_unless_told_otherwise() -> None:
-    trained = ActionExecution(temporal_ensemble=False, ensemble_decay=0.1, n_action_steps=4)
-    assert choose_execution(trained, PolicyOptions()) == trained
-    assert choose_execution(trained, PolicyOptions(execute=2)) == replace(trained, n_action_steps=2)
-    ensemble = choose_execution(trained, PolicyOptions(temporal_ensemble=True))
+    trained = Acting(temporal_ensemble=False, decay=0.1, execute=4)
+    assert choose_acting(trained, PolicyOptions()) == trained
+    assert choose_acting(trained, PolicyOptions(execute=2)) == replace(trained, execute=2)
+    ensemble = choose_acting(trained, PolicyOptions(temporal_ensemble=True))
     assert (ensemble.temporal_ensemble, ensemble.decay) == (True, 0.1)
 
 

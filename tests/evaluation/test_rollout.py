@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model
-from robo_manip_baselines.policy.execution import PolicyRunner
+from robo_manip_baselines.policy.execution import ChunkPolicy
 from robo_manip_baselines.policy.interface import PolicyModel
-from robo_manip_baselines.policy.presets import ActionExecution
+from robo_manip_baselines.policy.presets import Acting
 from robo_manip_baselines.rollout.demonstrate import demonstrate
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Policy, Recording, rollout
@@ -36,7 +36,7 @@ from robo_manip_baselines.runs.errors import RequestError
 pytestmark = pytest.mark.long
 
 SEEDS = [1004, 1000, 1007, 1001, 1003]
-FIRST = ActionExecution(temporal_ensemble=False, n_action_steps=4)
+FIRST = Acting(temporal_ensemble=False, execute=4)
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +52,10 @@ class Recurrent:
     def __init__(self, slots: int) -> None:
         self.memory = np.zeros((slots, 7))
 
-    def reset(self, slots: NDArray[np.intp], seeds: Sequence[int]) -> None:
+    def reset(self, slots: NDArray[np.intp]) -> None:
         self.memory[slots] = 0.0
 
-    def needs_images(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def looks(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         return np.zeros(len(slots), np.bool_)
 
     def act(
@@ -78,14 +78,14 @@ def play(policy: Policy, environments: Environments, seeds: list[int]) -> Played
     return results, recordings
 
 
-def network(checkpoint: Checkpoint, execution: ActionExecution, slots: int) -> PolicyRunner:
+def network(checkpoint: Checkpoint, acting: Acting, slots: int) -> ChunkPolicy:
     model, spec = load_model(checkpoint), checkpoint.spec
-    return PolicyRunner(model, spec, checkpoint.normalization, execution, num_envs=slots)
+    return ChunkPolicy(model, spec, checkpoint.normalization, acting, slots=slots)
 
 
 POLICIES: dict[str, Callable[[Checkpoint, int], Policy]] = {
     "recurrent": lambda _, slots: Recurrent(slots),
-    "ensemble": lambda checkpoint, slots: network(checkpoint, ActionExecution(), slots),
+    "ensemble": lambda checkpoint, slots: network(checkpoint, Acting(), slots),
     "first": lambda checkpoint, slots: network(checkpoint, FIRST, slots),
 }
 
@@ -250,13 +250,11 @@ class Seeing(PolicyModel):
 
     chunk_size = 4
 
-    def predict(
-        self, state: torch.Tensor, images: torch.Tensor | None, noise: torch.Tensor | None
-    ) -> torch.Tensor:
+    def predict(self, state: torch.Tensor, images: torch.Tensor | None) -> torch.Tensor:
         assert images is not None
         seen = images.float().flatten(1) / 255
         weight = torch.linspace(-1, 1, seen.shape[1])
-        glance = (seen * weight).mean(1) + 0.01 * state[:, -1].sum(1)
+        glance = (seen * weight).mean(1) + 0.01 * state.sum(1)
         return glance[:, None, None] * torch.linspace(-1, 1, 28).view(4, 7)
 
 
@@ -268,9 +266,9 @@ def test_a_network_that_sees_acts_the_same_in_any_arrangement(task: Task) -> Non
     ones, zeros = np.ones(seen.vector_size, np.float32), np.zeros(seen.vector_size, np.float32)
     scale = Normalization(zeros, ones, zeros[:7], ones[:7])
     played = []
-    for execution in (ActionExecution(), FIRST):
+    for acting in (Acting(), FIRST):
         for num_envs, workers in ((1, 0), (3, 2)):
-            policy = PolicyRunner(Seeing(), spec, scale, execution, num_envs=num_envs)
+            policy = ChunkPolicy(Seeing(), spec, scale, acting, slots=num_envs)
             with open_environments(seen, num_envs, workers) as environments:
                 _, recordings = play(policy, environments, SEEDS)
             played.append(np.array([recordings[seed].actions for seed in SEEDS]))

@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import (HOME_QPOS, JOINT_LIMITS)
-from robo_manip_baselines.observation.spec import ARM_JOINTS
+from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS, JOINT_LIMITS
 from robo_manip_baselines.envs.mujoco.expert.kinematics import (
     ORIENTATION_TOLERANCE,
     POSITION_TOLERANCE,
@@ -22,6 +21,7 @@ from robo_manip_baselines.envs.mujoco.expert.phases import level_at
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET
 from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import STANDOFF
+from robo_manip_baselines.observation.spec import ARM_JOINTS
 
 LIMITS = np.array([JOINT_LIMITS[joint] for joint in ARM_JOINTS])
 

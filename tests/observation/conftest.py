@@ -11,10 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robo_manip_baselines.observation import Truth
+from robo_manip_baselines.observation import (
+    ObservationSpec,
+    ObservedNames,
+    State,
+    TargetObservation,
+)
 
 HORIZONS = 5
 PERIOD = 0.02
+
+NAMES = ObservedNames("mouth", ("cube",))
 
 MakeStats = Callable[..., Path]
 
@@ -82,26 +89,33 @@ def write_stats(folder: Path, content: dict[str, Any]) -> Path:
     return path
 
 
-def wandering_truth(steps: int, seed: int = 0, *, predicted: bool = False) -> Truth:
+def wandering_truth(steps: int, seed: int = 0, *, predicted: bool = False) -> State:
     """An episode in which gripper and mouth wander about, (T, ...)."""
     rng = np.random.default_rng(seed)
     arm = rng.normal(size=(steps, 1, 6))
-    return Truth(
+    return State(
         time=np.arange(steps) * PERIOD,
         joint_position=arm,
         joint_velocity=arm,
         gripper_position=arm[..., 0],
         gripper_velocity=arm[..., 0],
         end_effector_position=rng.normal(size=(steps, 3)),
-        mouth_position=rng.normal(size=(steps, 6, 3)),
-        object_position=rng.normal(size=(steps, 3)),
-        predicted_mouth=rng.normal(size=(steps, 5, 3)) if predicted else None,
+        target_position=rng.normal(size=(steps, 6, 3)),
+        object_position=rng.normal(size=(steps, 1, 3)),
+        predicted_target=rng.normal(size=(steps, 5, 3)) if predicted else None,
     )
 
 
-def step_of(truth: Truth, index: int | slice) -> Truth:
+def step_of(truth: State, index: int | slice) -> State:
     """One step of an episode, or some."""
-    return Truth(**{k: None if v is None else v[index] for k, v in vars(truth).items()})
+    return State(**{k: None if v is None else v[index] for k, v in vars(truth).items()})
+
+
+def observe(
+    spec: ObservationSpec, state: State, target: TargetObservation | None = None
+) -> dict[str, np.ndarray]:
+    """The vectors of an observation by key."""
+    return spec.split(spec.pack(state, target), NAMES)
 
 
 @pytest.fixture(scope="session")

@@ -22,10 +22,11 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 from robo_manip_baselines.observation import Corruption, ObservationSpec
-from robo_manip_baselines.observation.state import vector_names
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
-from robo_manip_baselines.rollout.workers import Task
+from robo_manip_baselines.rollout.workers import EnvConfig
 from robo_manip_baselines.runs.errors import RequestError
+
+from .conftest import NAMES
 
 pytestmark = pytest.mark.long
 
@@ -90,20 +91,20 @@ def test_training_sees_what_evaluation_sees(
     assert loaded.spec == replace(spec, corruption=corruption.pinned())
     with EpisodeReader(loaded.paths[0]) as episode:
         actions = episode.array("action")
-    task = Task("FeedingEnv", loaded.spec, {"motion_library": str(library)})
+    config = EnvConfig("FeedingEnv", loaded.spec, {"motion_library": str(library)})
     shown = []
-    with closing(task.make()) as env:
+    with closing(config.make()) as env:
         observation, _ = env.reset(seed=SEED)
         for action in actions:
-            shown.append(np.concatenate([observation[key] for key in spec.components()]))
+            shown.append(np.concatenate([observation[key] for key in spec.components(NAMES)]))
             observation, *_ = env.step(action)
-    names = vector_names(spec)
+    names = spec.vector_names(NAMES)
     # Sums of squares may be added up in another order for a batch: one float32 ulp.
     exact = [not name.startswith("distance") for name in names]
     rows = np.array(shown)
     np.testing.assert_array_equal(loaded.state[:, exact], rows[:, exact])
     np.testing.assert_allclose(loaded.state, rows, rtol=3e-7)
-    plain = load_demonstrations(recorded, replace(spec, corruption=None)).state
+    plain = load_demonstrations(recorded, replace(spec, corruption=Corruption())).state
     told = [name[:2] in ("x_", "y_", "z_") or name.startswith("mouth") for name in names]
     assert (loaded.state[:, told] != plain[:, told]).mean() > 0.4
     felt = [not t and not n.startswith(("t_", "dist")) for t, n in zip(told, names, strict=True)]
@@ -142,7 +143,7 @@ def test_the_recorded_prediction_is_shown_in_step_with_the_face(library: Path) -
                 wanted = start + moved @ WORLD_FROM_CAMERA.T
                 told = observation["prediction"][:24].reshape(6, 4)[1:, 1:]
                 np.testing.assert_allclose(told, wanted, atol=1e-6)
-            assert world.truth().predicted_mouth is not None
+            assert world.state().predicted_target is not None
             observation, *_ = env.step(np.asarray(env.action_space.low))
 
 

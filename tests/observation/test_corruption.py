@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import ERRORS, MEASURED_ERRORS
 from robo_manip_baselines.observation.error_models import DRAWN_ERRORS
 from robo_manip_baselines.observation.error_stats import load_error_stats
-from robo_manip_baselines.observation.spec import CorruptionOptions
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -44,8 +42,8 @@ def test_invalid_settings_get_one_line(values: dict[str, Any], message: str) -> 
 
 def test_unknown_settings_are_named() -> None:
     with pytest.raises(RequestError, match=r"unknown setting .* 'dealy' .*did you mean 'delay'"):
-        Corruption.of({"dealy": 3})
-    assert Corruption.of({"delay": 3}) == Corruption(delay=3)
+        Corruption.from_json({"dealy": 3})
+    assert Corruption.from_json({"delay": 3}) == Corruption(delay=3)
 
 
 def test_every_measured_error_can_be_drawn() -> None:
@@ -65,17 +63,17 @@ def test_every_measured_error_can_be_drawn() -> None:
         (Corruption("uniform", seed=4), "uniform_draw4"),
     ],
 )
-def test_labels_tell_arms_apart(corruption: Corruption, label: str) -> None:
+def test_labels_tell_conditions_apart(corruption: Corruption, label: str) -> None:
     assert corruption.label == label
-    assert not corruption.is_off
+    assert corruption
 
 
 def test_one_switch_turns_everything_off() -> None:
-    for off in (None, Corruption(), Corruption(seed=3, face_dropout_length=4.0)):
+    for off in (Corruption(), Corruption(seed=3, face_dropout_length=4.0)):
         assert ObservationSpec(obs="current_pred", corruption=off) == ObservationSpec(
             obs="current_pred"
         )
-        assert ObservationSpec(obs="baseline", corruption=off).corruption is None
+        assert ObservationSpec(obs="baseline", corruption=off).corruption == Corruption()
 
 
 @pytest.mark.parametrize(
@@ -100,13 +98,13 @@ def test_there_must_be_something_to_corrupt(
 
 
 @pytest.mark.parametrize(
-    "corruption", [None, Corruption("uniform", delay=2), Corruption(detector_rate=10.0)]
+    "corruption", [Corruption(), Corruption("uniform", delay=2), Corruption(detector_rate=10.0)]
 )
-def test_a_spec_goes_through_json(corruption: Corruption | None) -> None:
+def test_a_spec_goes_through_json(corruption: Corruption) -> None:
     spec = ObservationSpec(obs="current_pred", cameras=("top",), corruption=corruption)
     stored = json.loads(json.dumps(spec.to_json()))
     assert ObservationSpec.from_json(stored) == spec
-    assert ("corruption" in stored) == (corruption is not None)
+    assert ("corruption" in stored) == bool(corruption)
 
 
 def test_a_spec_without_corruption_is_stored_as_ever() -> None:
@@ -131,36 +129,14 @@ def test_statistics_are_pinned_to_their_file(stats_file: Path) -> None:
         Corruption("gaussian", stats_sha256=own.stats_sha256).pinned()
 
 
-def test_what_is_typed_replaces_what_was_there() -> None:
-    typed = CorruptionOptions
+def test_overrides_keep_what_still_fits() -> None:
     trained = Corruption("uniform", "a.json", "ab" * 32, delay=2, seed=5)
-    assert typed().apply() is None
-    assert typed().apply(trained) == trained
-    assert typed(corruption=False, delay=3).apply(trained) is None
-    assert typed(delay=0).apply(trained) == Corruption("uniform", "a.json", "ab" * 32, seed=5)
-    assert typed(error="none").apply(trained) == Corruption(delay=2, seed=5)
-    assert typed(error="none", delay=0).apply(trained) is None
-    kept = typed(error="gaussian").apply(trained)
+    assert trained.override({}) == trained
+    assert trained.override({"delay": 0}) == Corruption("uniform", "a.json", "ab" * 32, seed=5)
+    assert trained.override({"error": "none"}) == Corruption(delay=2, seed=5)
+    assert not trained.override({"error": "none", "delay": 0})
+    kept = trained.override({"error": "gaussian"})
     assert kept == Corruption("gaussian", "a.json", "ab" * 32, delay=2, seed=5)
-    other = typed(error_stats=Path("b.json")).apply(trained)
+    other = trained.override({"error_stats": "b.json"})
     assert other == Corruption("uniform", "b.json", None, delay=2, seed=5)
-    everything = typed(
-        error="empirical",
-        error_stats=Path("c.json"),
-        delay=1,
-        face_dropout=0.2,
-        face_dropout_length=4.0,
-        detector_rate=9.0,
-        corruption_seed=6,
-    ).apply()
-    assert everything is not None
-    assert asdict(everything) == {
-        "error": "empirical",
-        "error_stats": "c.json",
-        "stats_sha256": None,
-        "delay": 1,
-        "face_dropout": 0.2,
-        "face_dropout_length": 4.0,
-        "detector_rate": 9.0,
-        "seed": 6,
-    }
+    assert trained.override({"error": "model"}) == Corruption("model", delay=2, seed=5)

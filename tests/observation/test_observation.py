@@ -9,25 +9,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.observation import ObservationSpec, Truth, observe
+from robo_manip_baselines.observation import ObservationSpec, State
 from robo_manip_baselines.runs.errors import RequestError
 
+from .conftest import NAMES, observe
 
-def truth(shape: tuple[int, ...], arms: int, seed: int = 0) -> Truth:
+
+def truth(shape: tuple[int, ...], arms: int, seed: int = 0) -> State:
     rng = np.random.default_rng(seed)
-    return Truth(
+    return State(
         time=rng.random(shape),
         joint_position=rng.random((*shape, arms, 6)),
         joint_velocity=rng.random((*shape, arms, 6)),
         gripper_position=rng.random((*shape, arms)),
         gripper_velocity=rng.random((*shape, arms)),
         end_effector_position=rng.random((*shape, 3)),
-        mouth_position=rng.random((*shape, 6, 3)),
-        object_position=rng.random((*shape, 3)),
+        target_position=rng.random((*shape, 6, 3)),
+        object_position=rng.random((*shape, 1, 3)),
     )
 
 
-def obvious(spec: ObservationSpec, true: Truth) -> dict[str, list[float]]:
+def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
     """One observation, number by number, as the tables of the docs say."""
     state: list[float] = []
     for arm in range(len(spec.arm_names)):
@@ -37,17 +39,17 @@ def obvious(spec: ObservationSpec, true: Truth) -> dict[str, list[float]]:
     gripper = true.end_effector_position
 
     def distance(k: int) -> float:
-        return float(sum((true.mouth_position[k] - gripper) ** 2) ** 0.5)
+        return float(sum((true.target_position[k] - gripper) ** 2) ** 0.5)
 
     if spec.obs == "current":
-        shown["mouth"] = [*true.mouth_position[0], distance(0)]
+        shown["mouth"] = [*true.target_position[0], distance(0)]
     if spec.obs == "current_pred":
         numbers: list[float] = []
         for k in range(spec.horizon + 1):
-            numbers += [float(true.time) + k / 30, *true.mouth_position[k]]
+            numbers += [float(true.time) + k / 30, *true.target_position[k]]
         shown["prediction"] = numbers + [distance(k) for k in range(spec.horizon + 1)]
     if spec.object_pose:
-        shown["object_position"] = [*true.object_position]
+        shown["object_position"] = [*true.object_position[0]]
     return shown
 
 
@@ -65,15 +67,15 @@ specs = st.builds(
 def test_observe_is_what_the_tables_say(spec: ObservationSpec, seed: int) -> None:
     true = truth((), len(spec.arm_names), seed)
     shown, expected = observe(spec, true), obvious(spec, true)
-    assert set(shown) == set(expected) == set(spec.components())
+    assert set(shown) == set(expected) == set(spec.components(NAMES))
     for key, value in shown.items():
         np.testing.assert_allclose(value, expected[key], rtol=1e-6)  # float32
         assert value.dtype == np.float32
-        assert len(spec.components()[key]) == value.shape[0]
+        assert len(spec.components(NAMES)[key]) == value.shape[0]
 
 
-def member(batch: Truth, *index: int) -> Truth:
-    return Truth(**{k: None if v is None else v[index] for k, v in vars(batch).items()})
+def member(batch: State, *index: int) -> State:
+    return State(**{k: None if v is None else v[index] for k, v in vars(batch).items()})
 
 
 @given(specs)
@@ -92,7 +94,7 @@ def test_sizes_of_the_papers_presets() -> None:
     sizes = {
         (obs, horizon): {
             key: len(names)
-            for key, names in ObservationSpec(obs=obs, horizon=horizon).components().items()
+            for key, names in ObservationSpec(obs=obs, horizon=horizon).components(NAMES).items()
         }
         for obs in ("baseline", "current", "current_pred")
         for horizon in (1, 2, 5)

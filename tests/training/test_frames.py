@@ -92,7 +92,7 @@ def test_damage_is_an_error_that_names_the_frame(tmp_path: Path, is_held: bool) 
                 source.images(np.array([6, 7]))
 
 
-def test_a_picture_that_is_none_names_the_frame(tmp_path: Path) -> None:
+def test_an_image_that_is_none_names_the_frame(tmp_path: Path) -> None:
     images = make_images(4, cameras=CAMERAS)
     images["top"][2] = np.arange(50, dtype=np.uint8)
     path = episode_path(tmp_path, 0, success=True)
@@ -100,7 +100,7 @@ def test_a_picture_that_is_none_names_the_frame(tmp_path: Path) -> None:
     loaded = load_demonstrations(tmp_path, ObservationSpec(cameras=("top",), image_size=(24, 32)))
     with (
         ImageStore(loaded, memory_budget=0) as source,
-        pytest.raises(RequestError, match="frame 2 of 'top': no picture"),
+        pytest.raises(RequestError, match="frame 2 of 'top': no image"),
     ):
         source.images(np.arange(4))
 

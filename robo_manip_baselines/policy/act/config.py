@@ -9,19 +9,10 @@ from robo_manip_baselines.policy.presets import (
     ActionExecution,
     PolicyPreset,
     TrainSettings,
+    require_at_least,
+    require_proportion,
 )
 from robo_manip_baselines.runs.errors import RequestError
-
-_COUNTS = (
-    "chunk_size",
-    "hidden_size",
-    "feedforward_size",
-    "num_heads",
-    "encoder_layers",
-    "decoder_layers",
-    "latent_size",
-    "cvae_layers",
-)
 
 
 @dataclass(frozen=True)
@@ -80,19 +71,13 @@ class ActConfig:
     paper_compat: bool = False
 
     def __post_init__(self) -> None:
-        for name in _COUNTS:
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
-        if self.state_layers < 0:
-            raise RequestError(f"state_layers {self.state_layers}: must be 0 or more")
+        require_at_least(1, self, "chunk_size", "hidden_size", "feedforward_size", "num_heads")
+        require_at_least(1, self, "encoder_layers", "decoder_layers", "latent_size", "cvae_layers")
+        require_at_least(0, self, "state_layers", "kl_weight", "backbone_learning_rate_factor")
+        require_proportion(self, "dropout")
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
-        for name in ("kl_weight", "backbone_learning_rate_factor"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more, and finite")
-        if not 0.0 <= self.dropout < 1.0:
-            raise RequestError(f"dropout {self.dropout}: must be 0 or more, less than 1")
 
 
 PRESETS = {

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from robo_manip_baselines.policy.presets import STATE_ONLY_TRAINING, ActionExecution, PolicyPreset
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.policy.presets import (
+    STATE_ONLY_TRAINING,
+    ActionExecution,
+    PolicyPreset,
+    require_at_least,
+    require_proportion,
+)
 
 
 @dataclass(frozen=True)
@@ -28,11 +33,8 @@ class MlpConfig:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("chunk_size", "hidden_size", "hidden_layers"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
-        if not 0.0 <= self.dropout < 1.0:
-            raise RequestError(f"dropout {self.dropout}: must be 0 or more, less than 1")
+        require_at_least(1, self, "chunk_size", "hidden_size", "hidden_layers")
+        require_proportion(self, "dropout")
 
 
 PRESETS = {

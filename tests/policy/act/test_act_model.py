@@ -174,7 +174,9 @@ def test_cameras_are_told_apart(make_model, make_batch):
     swapped = batch.images.flip(2)
     model = make_model()
     assert not torch.allclose(
-        model.predict(batch.state, batch.images, None), model.predict(batch.state, swapped, None), atol=1e-4
+        model.predict(batch.state, batch.images, None),
+        model.predict(batch.state, swapped, None),
+        atol=1e-4,
     )
     # In the public code they are not: to attention, tokens are a set.
     compat = make_model(paper_compat=True)
@@ -219,7 +221,9 @@ def test_any_image_size_and_number_of_cameras(
     assert torch.isfinite(model.loss(batch)["loss"])
 
 
-@pytest.mark.parametrize("given", [None, (3, 1, 2, 70, 40, 3), (3, 1, 1, 40, 70, 3), (3, 1, 2, 3, 40, 70)])
+@pytest.mark.parametrize(
+    "given", [None, (3, 1, 2, 70, 40, 3), (3, 1, 1, 40, 70, 3), (3, 1, 2, 3, 40, 70)]
+)
 def test_images_of_another_shape_are_refused(make_model, make_batch, given):
     images = None if given is None else torch.zeros(given, dtype=torch.uint8)
     with pytest.raises(ValueError, match=r"images of \(2, 40, 70, 3\) are needed"):

@@ -9,25 +9,32 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robo_manip_baselines.observation import Corruption, ObservationSpec, Report, Truth, observe
-from robo_manip_baselines.observation.detector import Detector
+from robo_manip_baselines.observation import (
+    Corruption,
+    CorruptionPipeline,
+    ObservationSpec,
+    State,
+    TargetObservation,
+)
 from robo_manip_baselines.observation.error_stats import load_error_stats
 from robo_manip_baselines.runs.errors import RequestError
 
-from .conftest import PERIOD, made_up_stats, step_of, wandering_truth, write_stats
+from .conftest import PERIOD, made_up_stats, observe, step_of, wandering_truth, write_stats
 
 MEASURED = ("uniform", "gaussian", "empirical")
 
 
-def step_by_step(detector: Detector, truth: Truth, seed: int) -> Report:
+def step_by_step(detector: CorruptionPipeline, truth: State, seed: int) -> TargetObservation:
     detector.reset(seed)
-    reports = [detector.report(step_of(truth, index)) for index in range(len(truth.time))]
-    return Report(np.stack([r.time for r in reports]), np.stack([r.mouth for r in reports]))
+    reports = [detector.observe(step_of(truth, index)) for index in range(len(truth.time))]
+    return TargetObservation(
+        *map(np.stack, zip(*((r.time, r.position) for r in reports), strict=True))
+    )
 
 
-def assert_same(one: Report, other: Report) -> None:
+def assert_same(one: TargetObservation, other: TargetObservation) -> None:
     np.testing.assert_array_equal(one.time, other.time)
-    np.testing.assert_array_equal(one.mouth, other.mouth)
+    np.testing.assert_array_equal(one.position, other.position)
 
 
 corruptions = st.builds(
@@ -46,12 +53,12 @@ corruptions = st.builds(
 @given(corruptions, st.integers(0, 2**32), st.integers(1, 60), st.integers(0, 9))
 def test_online_is_offline(corruption: Corruption, seed: int, steps: int, drawn: int) -> None:
     truth = wandering_truth(steps, drawn, predicted=True)
-    detector = Detector(corruption)
-    offline = detector.report_episode(truth, seed)
+    detector = CorruptionPipeline(corruption)
+    offline = detector.observe_episode(truth, seed)
     online = step_by_step(detector, truth, seed)
     assert_same(online, offline)
-    assert_same(step_by_step(Detector(corruption), truth, seed), offline)
-    assert offline.mouth.shape == (steps, 6, 3)
+    assert_same(step_by_step(CorruptionPipeline(corruption), truth, seed), offline)
+    assert offline.position.shape == (steps, 6, 3)
     assert (offline.time <= truth.time).all()
 
 
@@ -61,36 +68,41 @@ def test_online_is_offline(corruption: Corruption, seed: int, steps: int, drawn:
 def test_nothing_of_later_steps_is_used(corruption: Corruption, steps: int, cut: int) -> None:
     cut = min(cut, steps - 1)
     truth = wandering_truth(steps, predicted=True)
-    assert truth.predicted_mouth is not None
-    whole = Detector(corruption).report_episode(truth, 1)
-    truth.mouth_position[cut:] += 100.0
-    truth.predicted_mouth[cut:] -= 100.0
-    other = Detector(corruption).report_episode(truth, 1)
-    np.testing.assert_array_equal(other.mouth[:cut], whole.mouth[:cut])
-    assert not np.array_equal(other.mouth[-1], whole.mouth[-1]) or whole.time[-1] < truth.time[cut]
+    assert truth.predicted_target is not None
+    whole = CorruptionPipeline(corruption).observe_episode(truth, 1)
+    truth.target_position[cut:] += 100.0
+    truth.predicted_target[cut:] -= 100.0
+    other = CorruptionPipeline(corruption).observe_episode(truth, 1)
+    np.testing.assert_array_equal(other.position[:cut], whole.position[:cut])
+    assert (
+        not np.array_equal(other.position[-1], whole.position[-1])
+        or whole.time[-1] < truth.time[cut]
+    )
 
 
 def test_an_episode_may_be_longer_than_what_is_drawn_at_first() -> None:
     truth = wandering_truth(2200)  # 44 s
     for error in ("empirical", "gaussian"):
-        detector = Detector(Corruption(error=error, delay=2, face_dropout=0.2, detector_rate=7.0))
-        assert_same(step_by_step(detector, truth, 4), detector.report_episode(truth, 4))
+        detector = CorruptionPipeline(
+            Corruption(error=error, delay=2, face_dropout=0.2, detector_rate=7.0)
+        )
+        assert_same(step_by_step(detector, truth, 4), detector.observe_episode(truth, 4))
 
 
 def test_looking_twice_changes_nothing() -> None:
     truth = wandering_truth(30)
-    detector = Detector(Corruption(error="gaussian", delay=1, face_dropout=0.3))
+    detector = CorruptionPipeline(Corruption(error="gaussian", delay=1, face_dropout=0.3))
     detector.reset(7)
-    twice = [[detector.report(step_of(truth, i)).mouth for _ in range(2)][1] for i in range(30)]
-    np.testing.assert_array_equal(twice, detector.report_episode(truth, 7).mouth)
+    twice = [[detector.observe(step_of(truth, i)).position for _ in range(2)][1] for i in range(30)]
+    np.testing.assert_array_equal(twice, detector.observe_episode(truth, 7).position)
 
 
 @pytest.mark.parametrize("error", MEASURED)
 def test_an_error_lies_in_the_image_plane_and_lasts_a_frame(stats_file: Path, error: str) -> None:
     truth = wandering_truth(200)
     corruption = Corruption(error=error, error_stats=str(stats_file))
-    shown = Detector(corruption).report_episode(truth, 3)
-    added = shown.mouth - truth.mouth_position
+    shown = CorruptionPipeline(corruption).observe_episode(truth, 3)
+    added = shown.position - truth.target_position
     np.testing.assert_array_equal(shown.time, truth.time)
     np.testing.assert_array_equal(added[:, 0], 0.0)  # now: the detector's, not the forecast's
     np.testing.assert_array_equal(added[..., 0], 0.0)  # depth
@@ -111,7 +123,9 @@ def test_what_is_injected_is_what_the_paper_injects(tmp_path: Path) -> None:
     stats = str(write_stats(tmp_path, content))
     truth = wandering_truth(20_000)
     corruption = Corruption(error="uniform", error_stats=stats)
-    added = Detector(corruption).report_episode(truth, 0).mouth - truth.mouth_position
+    added = (
+        CorruptionPipeline(corruption).observe_episode(truth, 0).position - truth.target_position
+    )
     most = np.abs(added).max(axis=0)[1:]
     np.testing.assert_allclose(most[:, 1:], np.tile([0.0115, 0.0074], (5, 1)), rtol=2e-3)
 
@@ -124,7 +138,9 @@ def test_right_in_the_image_is_plus_y_and_down_is_minus_z(tmp_path: Path) -> Non
     stats = str(write_stats(tmp_path, content))
     truth = wandering_truth(3)
     corruption = Corruption(error="gaussian", error_stats=stats)
-    added = Detector(corruption).report_episode(truth, 0).mouth - truth.mouth_position
+    added = (
+        CorruptionPipeline(corruption).observe_episode(truth, 0).position - truth.target_position
+    )
     metres = load_error_stats(stats).bias[0]
     for k in range(1, 6):
         np.testing.assert_allclose(added[:, k], [[0.0, metres[0], -metres[1]]] * 3, atol=1e-12)
@@ -134,21 +150,21 @@ def test_every_arm_has_the_same_errors() -> None:
     """A longer horizon, a delay or losses change when errors are shown, not which they are."""
     truth = wandering_truth(120)
 
-    def shown(**more: float) -> Report:
+    def shown(**more: float) -> TargetObservation:
         corruption = Corruption(error="gaussian", **more)  # pyright: ignore[reportArgumentType]
-        return Detector(corruption).report_episode(truth, 11)
+        return CorruptionPipeline(corruption).observe_episode(truth, 11)
 
     plain, late = shown(), shown(delay=3)  # 5 steps
-    np.testing.assert_allclose(late.mouth[5:], plain.mouth[:-5], atol=1e-12)
+    np.testing.assert_allclose(late.position[5:], plain.position[:-5], atol=1e-12)
     np.testing.assert_allclose(late.time[5:], plain.time[:-5], atol=1e-12)
     held = shown(detector_rate=30.0)
     every = np.arange(0, 120, 5)  # where a frame falls on a step
-    np.testing.assert_allclose(held.mouth[every], plain.mouth[every], atol=1e-12)
+    np.testing.assert_allclose(held.position[every], plain.position[every], atol=1e-12)
     lost = shown(face_dropout=0.2, face_dropout_length=3.0)
     found = lost.time == truth.time
     found[:-1] &= np.diff(lost.time) > 0  # but for the very moments at which it gets lost
     assert 0.5 < found.mean() < 1.0
-    np.testing.assert_array_equal(lost.mouth[found], plain.mouth[found])
+    np.testing.assert_array_equal(lost.position[found], plain.position[found])
     spec = {
         horizon: ObservationSpec(
             obs="current_pred", horizon=horizon, cameras=(), corruption=Corruption("gaussian")
@@ -162,34 +178,39 @@ def test_every_arm_has_the_same_errors() -> None:
 def test_errors_are_drawn_from_the_episodes_seed() -> None:
     truth = wandering_truth(60)
     for corruption in (Corruption("uniform"), Corruption(face_dropout=0.4)):
-        again = [Detector(corruption).report_episode(truth, seed).mouth for seed in (0, 0, 1)]
+        again = [
+            CorruptionPipeline(corruption).observe_episode(truth, seed).position
+            for seed in (0, 0, 1)
+        ]
         np.testing.assert_array_equal(again[0], again[1])
         assert not np.array_equal(again[0], again[2])
         other = Corruption(**{**vars(corruption), "seed": 1})
-        assert not np.array_equal(Detector(other).report_episode(truth, 0).mouth, again[0])
+        assert not np.array_equal(
+            CorruptionPipeline(other).observe_episode(truth, 0).position, again[0]
+        )
 
 
 def test_the_predictors_own_output_is_shown_at_video_frames() -> None:
     truth = wandering_truth(61, predicted=True)
-    assert truth.predicted_mouth is not None
-    shown = Detector(Corruption("model")).report_episode(truth, 0)
-    np.testing.assert_array_equal(shown.mouth[:, 0], truth.mouth_position[:, 0])
+    assert truth.predicted_target is not None
+    shown = CorruptionPipeline(Corruption("model")).observe_episode(truth, 0)
+    np.testing.assert_array_equal(shown.position[:, 0], truth.target_position[:, 0])
     every = np.arange(0, 61, 5)  # frames 0, 3, 6 ...
-    np.testing.assert_allclose(shown.mouth[every, 1:], truth.predicted_mouth[every], atol=1e-12)
+    np.testing.assert_allclose(shown.position[every, 1:], truth.predicted_target[every], atol=1e-12)
     # Between them the error of the last frame is held: frame 1 begins with step 2.
-    error = shown.mouth[:, 1:] - truth.mouth_position[:, 1:]
+    error = shown.position[:, 1:] - truth.target_position[:, 1:]
     np.testing.assert_allclose(error[1], error[0], atol=1e-12)
     np.testing.assert_allclose(error[3], error[2], atol=1e-12)
     np.testing.assert_allclose(
-        error[2], truth.predicted_mouth[2] - truth.mouth_position[2, 1:], atol=1e-12
+        error[2], truth.predicted_target[2] - truth.target_position[2, 1:], atol=1e-12
     )
 
 
 def test_without_predictions_the_model_has_nothing_to_show() -> None:
     truth = wandering_truth(4)
-    detector = Detector(Corruption("model"))
+    detector = CorruptionPipeline(Corruption("model"))
     with pytest.raises(RequestError, match=r"no predicted mouth.*face_prediction predict"):
-        detector.report_episode(truth, 0)
+        detector.observe_episode(truth, 0)
     with pytest.raises(RequestError, match=r"no predicted mouth"):
         step_by_step(detector, truth, 0)
 
@@ -201,25 +222,25 @@ def test_statistics_must_reach_as_far_as_what_is_shown(tmp_path: Path) -> None:
             obs="current_pred", horizon=horizon, corruption=Corruption("uniform", stats)
         )
         if horizon <= 3:
-            assert Detector.of(spec)
+            assert spec.make_pipeline()
             continue
         with pytest.raises(RequestError, match="go 3 frames ahead; choose a horizon up to that"):
-            Detector.of(spec)
-    assert Detector.of(ObservationSpec()) is None
+            spec.make_pipeline()
+    assert ObservationSpec().make_pipeline() is None
 
 
 def test_a_report_is_shown_with_its_time_and_the_gripper_of_now() -> None:
     truth = wandering_truth(30)
     corruption = Corruption(delay=3)
     spec = ObservationSpec(obs="current_pred", horizon=1, cameras=(), corruption=corruption)
-    report = Detector(corruption).report_episode(truth, 0)
+    report = CorruptionPipeline(corruption).observe_episode(truth, 0)
     shown = observe(spec, truth, report)["prediction"]
     assert shown.shape == (30, 10)
     late = step_of(truth, slice(0, 25))
     np.testing.assert_allclose(shown[5:, 0], late.time, atol=1e-6)
     np.testing.assert_allclose(shown[5:, 4], late.time + 1 / 30, atol=1e-6)
-    np.testing.assert_allclose(shown[5:, 1:4], late.mouth_position[:, 0], rtol=1e-6, atol=1e-6)
-    apart = late.mouth_position[:, 1] - truth.end_effector_position[5:]
+    np.testing.assert_allclose(shown[5:, 1:4], late.target_position[:, 0], rtol=1e-6, atol=1e-6)
+    apart = late.target_position[:, 1] - truth.end_effector_position[5:]
     np.testing.assert_allclose(shown[5:, 9], np.linalg.norm(apart, axis=1), rtol=1e-6)
     current = ObservationSpec(obs="current", cameras=(), corruption=corruption)
     np.testing.assert_array_equal(observe(current, truth, report)["mouth"][:, :3], shown[:, 1:4])

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
-from robo_manip_baselines.data.demonstrations import recorded_truth
+from robo_manip_baselines.data.demonstrations import recorded_state
 from robo_manip_baselines.data.example import make_arrays, make_attributes
-from robo_manip_baselines.observation import ObservationSpec, observe
+from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
 from robo_manip_baselines.rollout.replay import remake_env
+
+from .conftest import NAMES, observe
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,7 @@ def test_a_file_read_with_a_preset_is_what_the_environment_shows(
             remake_env(episode, obs=spec.obs, horizon=spec.horizon, object_pose=spec.object_pose)
         ) as env,
     ):
-        read = observe(spec, recorded_truth(episode))
+        read = observe(spec, recorded_state(episode))
         shown, _ = env.reset(seed=episode.attributes["seed"])
         for step, action in enumerate(episode.array("action")):
             for key, value in shown.items():
@@ -56,10 +58,10 @@ def test_two_arms_are_told_apart(tmp_path: Path) -> None:
     path = write_episode(tmp_path / "a.hdf5", arrays, {}, make_attributes(arms=2))
     spec = ObservationSpec(arms="both", cameras=())
     with EpisodeReader(path) as episode:
-        truth = recorded_truth(episode)
+        truth = recorded_state(episode)
     assert truth.joint_position.shape == truth.joint_velocity.shape == (5, 2, 6)
     assert truth.gripper_position.shape == (5, 2)
-    names = spec.components()["state"]
+    names = spec.components(NAMES)["state"]
     state = dict(zip(names, observe(spec, truth)["state"].T, strict=True))
     for arm, first in (("left", 0), ("right", 6)):
         for field in ("position", "velocity"):

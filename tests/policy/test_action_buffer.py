@@ -75,10 +75,12 @@ def test_every_environment_acts_as_if_it_were_alone(
     reset_at: int,
     seed: int,
 ) -> None:
-    """Execute 0 stands for the ensemble. Environment 0 starts another episode at turn ``reset_at``."""
+    """Execute 0 stands for the ensemble. Environment 0 starts a new episode at ``reset_at``."""
     num_envs, turns = schedule
     execute = min(execute, size)
-    execution = ActionExecution(temporal_ensemble=execute == 0, ensemble_decay=decay, n_action_steps=max(execute, 1))
+    execution = ActionExecution(
+        temporal_ensemble=execute == 0, ensemble_decay=decay, n_action_steps=max(execute, 1)
+    )
     play = Play(make_action_buffer(execution, num_envs, size, ACTION_SIZE))
     rng = np.random.default_rng(seed)
     # Zeros among them: a prediction of zero is a prediction.
@@ -117,7 +119,10 @@ def test_the_ensemble_of_two() -> None:
 def test_an_episode_knows_nothing_of_the_last_one_in_its_environment() -> None:
     rng = np.random.default_rng(0)
     chunks = rng.normal(size=(2, 5, 4, ACTION_SIZE)).astype(np.float32)
-    for execution in (ActionExecution(ensemble_decay=0.5), ActionExecution(temporal_ensemble=False, n_action_steps=3)):
+    for execution in (
+        ActionExecution(ensemble_decay=0.5),
+        ActionExecution(temporal_ensemble=False, n_action_steps=3),
+    ):
         used, fresh = (make_action_buffer(execution, 2, 4, ACTION_SIZE) for _ in range(2))
         env = np.array([1])
         for chunk in chunks[0]:
@@ -150,5 +155,7 @@ def test_a_chunk_is_asked_for_only_when_the_last_is_used_up() -> None:
 
 @pytest.mark.parametrize("execute", [6, 100])
 def test_no_more_than_a_chunk_can_be_carried_out(execute: int) -> None:
-    with pytest.raises(RequestError, match=rf"\(--execute\) {execute}: must be 1 to 5"):
-        make_action_buffer(ActionExecution(temporal_ensemble=False, n_action_steps=execute), 1, 5, 1)
+    with pytest.raises(RequestError, match=f"n_action_steps {execute}: must be 1 to 5"):
+        make_action_buffer(
+            ActionExecution(temporal_ensemble=False, n_action_steps=execute), 1, 5, 1
+        )

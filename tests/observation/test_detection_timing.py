@@ -8,20 +8,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robo_manip_baselines.observation import Corruption
-from robo_manip_baselines.observation.detector import Schedule, draw_lost, frame_of
+from robo_manip_baselines.observation.corruption import DetectionTiming, draw_lost, frame_of
 
 FRAMES = 40
 STEP = 0.02
 
 
-def schedule(lost: tuple[int, ...] = (), frames: int = FRAMES, **settings: float) -> Schedule:
+def schedule(
+    lost: tuple[int, ...] = (), frames: int = FRAMES, **settings: float
+) -> DetectionTiming:
     is_lost = np.zeros(frames, np.bool_)
     is_lost[list(lost)] = True
-    return Schedule.of(Corruption(**settings), is_lost)  # pyright: ignore[reportArgumentType]
+    return DetectionTiming.of(Corruption(**settings), is_lost)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_delay_shows_the_first_report_until_the_second_arrives() -> None:
-    """At the camera's own rate: the table in the docstring of `Schedule.seen_at`."""
+    """At the camera's own rate: the table in the docstring of `DetectionTiming.seen_at`."""
     seen, frame = schedule(delay=3).seen_at(np.arange(6) / 30)
     np.testing.assert_allclose(seen * 30, [0, 0, 0, 0, 1, 2], atol=1e-9)
     assert frame.tolist() == [0, 0, 0, 0, 1, 2]
