@@ -67,9 +67,7 @@ def play(world: FeedingEnv, expert: str, seed: int) -> ExpertEpisode:
         force = max(force, info["face_force"])
         if world.progress.phase is Phase.CARRY:
             gripper = mink.SO3(world.gripper_orientation)
-            carried.append(
-                gripper.inverse().apply(world.cube_position - world.gripper_position)
-            )
+            carried.append(gripper.inverse().apply(world.cube_position - world.gripper_position))
         if terminated:
             break
     time = world.progress.completion_time

@@ -1,6 +1,6 @@
 """Failures of the conditions of a benchmark: shared episodes, distance from success, mouth motion.
 
-    python benchmarks/feeding_failures.py docs/results/feeding-cpu/results.jsonl
+python benchmarks/feeding_failures.py docs/results/feeding-cpu/results.jsonl
 """
 
 from __future__ import annotations

@@ -109,14 +109,16 @@ def test_the_closest_approach_counts_only_while_the_cube_is_carried() -> None:
 def test_nearest_is_meant_in_units_of_the_tolerances() -> None:
     """2.9 cm out is nearer than 2 cm low: it is within the tolerance, the other is twice it."""
     metrics = metrics_of(info("carry", (0.029, 0.5, 0.35)), info("carry", (0.0, 0.5, 0.33)))
-    failure, columns = metrics.result(info("carry", (0.0, 0.5, 0.33)))
+    _, columns = metrics.result(info("carry", (0.0, 0.5, 0.33)))
     assert columns["closest_offset"] == pytest.approx((0.029, 0.0, 0.0))
     assert columns["cube_offset"] == pytest.approx((0.017, 0.0, 0.0))
     assert columns["closest_distance"] == pytest.approx(0.02)
 
 
 def test_without_a_lift_there_is_no_closest_approach() -> None:
-    failure, columns = metrics_of(info("grasp", (0.0, 0.5, 0.35))).result(info("reach", (0.0, 0.5, 0.35)))
+    failure, columns = metrics_of(info("grasp", (0.0, 0.5, 0.35))).result(
+        info("reach", (0.0, 0.5, 0.35))
+    )
     assert (columns["closest_distance"], columns["closest_offset"]) == (None, None)
     assert columns["cube_offset"] is None
     assert failure == "never_grasped"
@@ -124,5 +126,5 @@ def test_without_a_lift_there_is_no_closest_approach() -> None:
 
 def test_a_success_has_no_kind_of_failure() -> None:
     last = info("deliver", (0.0, 0.5, 0.35), is_success=True, completion_time=4.3)
-    failure, columns = metrics_of(last).result(last)
+    failure, _ = metrics_of(last).result(last)
     assert failure == ""

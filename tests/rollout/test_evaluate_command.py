@@ -167,7 +167,10 @@ def children_of_group(group: int) -> list[int]:
         ("--precision fp8", "unknown precision 'fp8'"),
         ("--clips me", "unknown clip 'me'"),
         ("--error uniform", "trained with no corruption, not with error uniform, stats_sha256"),
-        ("--delay 3", "not with delay 3; leave the options as trained, or give --change_corruption"),
+        (
+            "--delay 3",
+            "not with delay 3; leave the options as trained, or give --change_corruption",
+        ),
         ("--change_corruption --error some", "unknown error model 'some'"),
         ("--change_corruption --error uniform --error_stats no.json", "'no.json' cannot be read"),
         ("--face_motion no", "unknown face motion 'no'"),

@@ -111,7 +111,11 @@ def alone(env_config: EnvConfig, checkpoint: Checkpoint) -> dict[str, Played]:
 @pytest.mark.parametrize("workers", [0, 1, 2])
 @pytest.mark.parametrize("num_envs", [1, 3, 8])
 def test_an_episode_depends_on_its_seed_alone(
-    env_config: EnvConfig, checkpoint: Checkpoint, alone: dict[str, Played], num_envs: int, workers: int
+    env_config: EnvConfig,
+    checkpoint: Checkpoint,
+    alone: dict[str, Played],
+    num_envs: int,
+    workers: int,
 ) -> None:
     """Bit for bit: what was seen and done at every step, and what it came to."""
     with open_envs(env_config, num_envs, workers) as envs:
@@ -208,7 +212,9 @@ def test_a_worker_that_dies_is_an_error_and_not_a_hang(env_config: EnvConfig) ->
 
     with (
         WorkerEnvs(env_config, 4, 2) as envs,
-        pytest.raises(RuntimeError, match=r"worker process of environments 1, 3 died \(exit code -9\)"),
+        pytest.raises(
+            RuntimeError, match=r"worker process of environments 1, 3 died \(exit code -9\)"
+        ),
     ):
         rollout(Murderer(4), envs, range(8))
     assert multiprocessing.active_children() == []

@@ -43,7 +43,6 @@ def change(result: EpisodeResult, **columns: float | None) -> EpisodeResult:
     return replace(result, columns={**result.columns, **columns})
 
 
-
 LOW = replace(
     change(HIT, closest_distance=0.030, face_force=2.5),
     is_success=False,

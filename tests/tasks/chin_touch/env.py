@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from chin_touch import ENTRY
 from numpy.typing import NDArray
 
+from chin_touch import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 
 CHIN = 199

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from chin_touch.env import ChinTouchEnv
 
+from chin_touch.env import ChinTouchEnv
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED
 from robo_manip_baselines.envs.mujoco.expert.phases import (
     Command,
