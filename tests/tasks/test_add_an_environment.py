@@ -29,11 +29,11 @@ TASKS = Path(__file__).parent
 PAGE = ROOT / "docs" / "add-an-environment.md"
 EPISODES = 6
 
-POLICY = '''
+POLICY = """
 from robo_manip_baselines.policy.registry import POLICIES
 
 ENTRY = POLICIES["Mlp"]
-'''
+"""
 
 
 def test_the_page_holds_the_files_of_the_task() -> None:
@@ -46,7 +46,9 @@ def test_the_page_names_methods_that_exist() -> None:
     table = PAGE.read_text().partition("| method | purpose |")[2].partition("\n\n")[0]
     names = re.findall(r"^\| `(\w+)\(", table, re.M)
     assert len(names) >= 8
-    section = inspect.getsource(FaceEnv).partition("# -- task --")[2].partition("# -- indices --")[0]
+    section = (
+        inspect.getsource(FaceEnv).partition("# -- task --")[2].partition("# -- indices --")[0]
+    )
     in_section = set(re.findall(r"def (\w+)\(", section))
     assert in_section - {"predicted_target"} == set(names) - {"start_attributes"}
 

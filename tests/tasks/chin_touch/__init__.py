@@ -16,8 +16,8 @@ ENTRY = TaskEntry(
     experts={"reactive": "chin_touch.expert:ChinTouchExpert"},
     metrics="chin_touch.metrics:ChinTouchMetrics",
     failures={
-        "too_far": "the gripper was never within 0.03 m of the chin",
-        "no_contact": "it was, and never touched the face there",
+        "too_far": "the finger tips were never within 0.03 m of the chin",
+        "missed": "they were, but never within 0.01 m with the gripper closed",
     },
     names=ObservedNames(target="chin"),
     target_field="chin_position",
@@ -35,11 +35,13 @@ ENTRY = TaskEntry(
     ),
     attributes=FACE_ATTRIBUTES,
     columns=(
-        ResultColumn("chin_distance", "float", "m, smallest distance gripper-chin"),
+        ResultColumn(
+            "chin_distance", "float", "m, smallest distance of the finger tips from the chin"
+        ),
         ResultColumn(
             "face_force", "float", "N, largest normal force between robot and face", in_report=True
         ),
     ),
-    success="the gripper touched the face within 0.03 m of the chin",
-    strict_success="and never pressed it with more than 5 N",
+    success="the tips of the closed fingers came within 0.01 m of the chin",
+    strict_success="and the robot never pressed the face with more than 5 N",
 )

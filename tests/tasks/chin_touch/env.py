@@ -5,22 +5,28 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from chin_touch import ENTRY
 from numpy.typing import NDArray
 
+from chin_touch import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 
 CHIN = 199
 """Landmark of the face in the middle of the chin."""
 
-TOLERANCE = 0.03
-"""m between gripper and chin within which a contact with the face counts as a touch."""
+FINGER_LENGTH = 0.018
+"""m from the site ``right/gripper`` to the finger tips."""
+
+CLOSED = 0.03
+"""m, position of a finger below which the gripper is closed."""
+
+TOLERANCE = 0.01
+"""m between finger tips and chin within which the chin is touched."""
 
 GENTLE_FORCE = 5.0
 """N up to which a touch is gentle."""
 
 CLEAR_DISTANCE = 0.10
-"""m between gripper and chin from which the gripper has withdrawn."""
+"""m between finger tips and chin from which the gripper has withdrawn."""
 
 
 class ChinTouchEnv(FaceEnv):
@@ -42,11 +48,11 @@ class ChinTouchEnv(FaceEnv):
 
     | key | type | content |
     |---|---|---|
-    | ``is_success`` | bool | the gripper has touched the face within 0.03 m of the chin |
+    | ``is_success`` | bool | the tips of the closed fingers have come within 0.01 m of the chin |
     | ``is_success_strict`` | bool | ``is_success``, and no force on the face has exceeded 5 N |
     | ``completion_time`` | float or None | s from the start to ``is_success``; None before |
     | ``phase`` | str | approach or withdraw |
-    | ``chin_distance`` | float | m between gripper and chin |
+    | ``chin_distance`` | float | m between finger tips and chin |
     | ``face_force`` | float | N, the largest normal force between robot and face in the step |
 
     ## Episode end
@@ -73,8 +79,15 @@ class ChinTouchEnv(FaceEnv):
 
     @property
     def chin_distance(self) -> float:
-        """m between gripper and chin."""
-        return float(np.linalg.norm(self.gripper_position - self.target_track()[0]))
+        """m between finger tips and chin."""
+        forward = self.data.site("right/gripper").xmat.reshape(3, 3)[:, 0]
+        tips = self.gripper_position + FINGER_LENGTH * forward
+        return float(np.linalg.norm(tips - self.target_track()[0]))
+
+    @property
+    def is_closed(self) -> bool:
+        """The right gripper is closed."""
+        return bool(self.data.joint("right/left_finger").qpos[0] < CLOSED)
 
     def simulate(self, action: NDArray[Any]) -> None:
         """Apply an action for one control period, recording the force on the face."""
@@ -89,11 +102,10 @@ class ChinTouchEnv(FaceEnv):
         """Evaluate the task after a control step; return reward and whether it has ended."""
         self.start_motion()
         self._largest_force = max(self._largest_force, self._force)
-        is_first = False
-        if self._touch_time is None and self._force > 0.0 and self.chin_distance < TOLERANCE:
-            self._touch_time, is_first = self.time, True
-        is_over = self._touch_time is not None and self.chin_distance >= CLEAR_DISTANCE
-        return float(is_first), is_over
+        distance, reward = self.chin_distance, 0.0
+        if self._touch_time is None and self.is_closed and distance < TOLERANCE:
+            self._touch_time, reward = self.time, 1.0
+        return reward, self._touch_time is not None and distance >= CLEAR_DISTANCE
 
     def info(self) -> dict[str, Any]:
         """Return what the class docstring lists under Info."""

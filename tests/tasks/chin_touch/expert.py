@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from chin_touch.env import ChinTouchEnv
 
+from chin_touch.env import FINGER_LENGTH, ChinTouchEnv
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED
 from robo_manip_baselines.envs.mujoco.expert.phases import (
     Command,
@@ -23,7 +23,7 @@ STANDOFF = np.array([0.12, 0.0, 0.0])
 NEAR = np.array([0.04, 0.0, 0.0])
 """m from the chin to the gripper before it slows down."""
 
-TOUCH = np.array([0.015, 0.0, 0.0])
+TOUCH = np.array([FINGER_LENGTH, 0.0, 0.0])
 """m from the chin to the gripper when its finger tips touch."""
 
 

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from chin_touch.env import TOLERANCE
+
+NEAR = 0.03
+"""m between finger tips and chin within which a miss is a near one."""
 
 
 class ChinTouchMetrics:
@@ -22,7 +24,7 @@ class ChinTouchMetrics:
 
     def result(self, info: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         """Return the kind of failure and the columns of the result row."""
-        failure = "no_contact" if self._distance < TOLERANCE else "too_far"
+        failure = "missed" if self._distance < NEAR else "too_far"
         return (
             "" if info["is_success"] else failure,
             {"chin_distance": self._distance, "face_force": self._force},

@@ -58,9 +58,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     """Cell with two arms and a head that moves as a recorded person moved.
 
     A task derives from it and implements the methods of the section "task": its objects, their
-    start, and after each step the reward, the end and ``info`` (``docs/add-an-environment.md``). The ``info`` of every task holds
-    ``is_success`` and ``is_success_strict`` (bool), ``completion_time`` (s, None before success)
-    and ``phase`` (one of ``phase_names``).
+    start, and after each step the reward, the end and ``info``; ``docs/add-an-environment.md``
+    makes one. The ``info`` of every task holds ``is_success`` and ``is_success_strict`` (bool),
+    ``completion_time`` (s, None before success) and ``phase`` (one of ``phase_names``).
 
     Args:
         obs, horizon, cameras, image_size, object_pose, arms: see `ObservationSpec`.
