@@ -13,8 +13,7 @@ import argparse
 import numpy as np
 from tqdm import tqdm
 
-from robo_manip_baselines.benchmark.statistics.inference import paired_success
-from robo_manip_baselines.benchmark.statistics.inference import rate_estimate
+from robo_manip_baselines.benchmark.statistics.inference import paired_success, rate_estimate
 from robo_manip_baselines.rollout.results import Proportion
 
 DIFFICULTY = 1.2

@@ -1,4 +1,4 @@
-"""Made-up result rows of a whole benchmark: sixteen conditions, two training seeds, 100 episodes."""
+"""Made-up result rows of a benchmark: sixteen conditions, two training seeds, 100 episodes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, read_result_rows
 from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, read_result_rows
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import failure_kind
 from robo_manip_baselines.rollout.results import EpisodeResult
@@ -32,7 +32,10 @@ MakeRows = Callable[..., tuple[ResultRow, ...]]
 
 
 def make_results(
-    conditions: Sequence[str] = tuple(CONDITIONS), train_seeds: int = 2, episodes: int = 100, seed: int = 0
+    conditions: Sequence[str] = tuple(CONDITIONS),
+    train_seeds: int = 2,
+    episodes: int = 100,
+    seed: int = 0,
 ) -> list[EpisodeResult]:
     """Draw results; easy seeds are easy for all conditions, and training runs differ."""
     rng = np.random.default_rng(seed)

@@ -40,7 +40,9 @@ def figures(statistics: BenchmarkStatistics) -> dict[str, ReportFigure]:
     return {figure.name: figure for figure in benchmark_figures(statistics)}
 
 
-def test_all_are_drawn_and_say_what_is_to_be_seen(figures: dict[str, ReportFigure], statistics: BenchmarkStatistics) -> None:
+def test_all_are_drawn_and_say_what_is_to_be_seen(
+    figures: dict[str, ReportFigure], statistics: BenchmarkStatistics
+) -> None:
     assert list(figures) == [
         "success_by_horizon",
         "completion_times",
@@ -64,7 +66,9 @@ def test_success_against_the_horizon(figures: dict[str, ReportFigure]) -> None:
     assert {"paper, without error", "paper, with error"} <= set(text)
 
 
-def test_numbers_of_the_surface(figures: dict[str, ReportFigure], statistics: BenchmarkStatistics) -> None:
+def test_numbers_of_the_surface(
+    figures: dict[str, ReportFigure], statistics: BenchmarkStatistics
+) -> None:
     text = words(figures["delay_and_horizon"])
     shown = [
         c
@@ -91,7 +95,9 @@ def test_every_episode_is_drawn_or_counted(statistics: BenchmarkStatistics) -> N
     assert len(markers) + missing == 200
 
 
-def test_the_same_figures_give_the_same_bytes(figures: dict[str, ReportFigure], statistics: BenchmarkStatistics) -> None:
+def test_the_same_figures_give_the_same_bytes(
+    figures: dict[str, ReportFigure], statistics: BenchmarkStatistics
+) -> None:
     again = render_figure("completion_times", "", draw_completion_times, statistics)
     assert again.svg == figures["completion_times"].svg
     assert "<dc:date>" not in figures["completion_times"].svg
@@ -120,7 +126,9 @@ def test_files_have_a_white_ground(tmp_path: Path, figures: dict[str, ReportFigu
 
 
 def test_many_episodes_become_pixels(
-    monkeypatch: pytest.MonkeyPatch, statistics: BenchmarkStatistics, figures: dict[str, ReportFigure]
+    monkeypatch: pytest.MonkeyPatch,
+    statistics: BenchmarkStatistics,
+    figures: dict[str, ReportFigure],
 ) -> None:
     monkeypatch.setattr("robo_manip_baselines.benchmark.report.figures.MANY_POINTS", 10)
     one = replace(statistics, conditions=statistics.conditions[:1])
@@ -157,7 +165,9 @@ def test_a_task_with_kinds_of_failure_of_its_own(make_rows: MakeRows) -> None:
         replace(row, result=replace(row.result, failure=f"kind_{number % 9}"))
         for number, row in enumerate(failed)
     ]
-    task = replace(TASK, failures=kinds, study="", completion_time="from the first touch to success")
+    task = replace(
+        TASK, failures=kinds, study="", completion_time="from the first touch to success"
+    )
     statistics = analyze(named, task=task, resamples=50)
     figures = {figure.name: figure for figure in benchmark_figures(statistics)}
     assert list(figures) == ["success_by_horizon", "completion_times", "failures"]

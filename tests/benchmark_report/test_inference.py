@@ -256,8 +256,13 @@ def test_newcombes_interval_is_made_of_wilsons(count: int, total: int) -> None:
 def test_nothing_beside_the_paper() -> None:
     assert published_success(Proportion.of(1, 2), 2, None, 0) == NO_COMPARISON
     assert published_time(np.array([4.0]), None, 0.0) == NO_COMPARISON
-    assert published_success(Proportion.of(0, 0), 0, STUDY.published["current"], STUDY.trials).p is None
-    assert published_time(np.array([NAN]), STUDY.published["current"], STUDY.time_rounding).p is None
+    assert (
+        published_success(Proportion.of(0, 0), 0, STUDY.published["current"], STUDY.trials).p
+        is None
+    )
+    assert (
+        published_time(np.array([NAN]), STUDY.published["current"], STUDY.time_rounding).p is None
+    )
     once = published_time(np.array([4.0]), STUDY.published["current"], STUDY.time_rounding)
     assert (once.difference.mean, once.p) == (pytest.approx(-0.6), None)
 
@@ -275,7 +280,8 @@ def test_times_beside_the_paper() -> None:
     assert (found.difference.low, found.difference.high) == pytest.approx(
         (-0.65 - half, -0.65 + half), abs=1e-5
     )
-    near = published_time(times, PublishedResult(3, 4.44), STUDY.time_rounding)  # no farther than the rounding
+    # No farther than the rounding.
+    near = published_time(times, PublishedResult(3, 4.44), STUDY.time_rounding)
     assert near.p == 1.0
 
 

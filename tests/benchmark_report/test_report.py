@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.benchmark.report.page import (
     EpisodeVideo,
     Report,
@@ -28,9 +27,10 @@ from robo_manip_baselines.benchmark.report.page import (
     render_report,
     write_report,
 )
+from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
 from robo_manip_baselines.benchmark.statistics.conditions import FURTHER, ConditionDescription
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, RowSelection
-from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.rollout.videos import VideoWriter
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -233,9 +233,7 @@ def test_episodes_to_show_are_the_first_of_their_kind(make_rows: MakeRows) -> No
     assert success == next(row for row in ordered if row.result.is_success)
     kinds = [row.result.failure for row in ordered if not row.result.is_success]
     assert kinds.count(failure.result.failure) == max(map(kinds.count, kinds))
-    assert failure == next(
-        row for row in ordered if row.result.failure == failure.result.failure
-    )
+    assert failure == next(row for row in ordered if row.result.failure == failure.result.failure)
     won = tuple(row for row in rows if row.result.is_success)
     assert len(episodes_to_show(analyze(won, task=TASK, resamples=50))) == 1
 

@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.benchmark.report.page import (
     episodes_to_show,
     link,
-    read_video,
     make_report,
+    read_video,
     write_report,
 )
-from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow
 from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow
 from robo_manip_baselines.benchmark.tables.benchmark import benchmark_tables
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.rollout.videos import VideoWriter
 
 pytestmark = pytest.mark.long

@@ -147,8 +147,12 @@ def test_rows_of_the_benchmark(statistics: BenchmarkStatistics) -> None:
     assert list(rows_of(tables, "completion_times")) == names
     assert list(rows_of(tables, "failures")) == names
     assert list(rows_of(tables, "success_differences")) == [n for n in names if n != "current"]
-    assert list(rows_of(tables, "success_beside_paper")) == [n for n in names if n in STUDY.published]
-    assert list(rows_of(tables, "completion_times_beside_paper")) == [n for n in names if n in STUDY.published]
+    assert list(rows_of(tables, "success_beside_paper")) == [
+        n for n in names if n in STUDY.published
+    ]
+    assert list(rows_of(tables, "completion_times_beside_paper")) == [
+        n for n in names if n in STUDY.published
+    ]
     verdicts = rows_of(tables, "findings")
     assert [row["paper"] == "" for row in verdicts.values()] == 5 * [False] + [True]
 

@@ -156,44 +156,35 @@ def write_figures(folder: Path, figures: Sequence[ReportFigure]) -> list[Path]:
 def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
     """Draw success against the horizon, with and without error, and published results."""
     figure.set_size_inches(8.0, 4.6)
-    axes, study = figure.add_subplot(), statistics.study
-    last = 0
+    axes, last = figure.add_subplot(), 0
+    conditions, study = statistics.conditions, statistics.study
     for group, error, color, label, shift in (
         (BASELINE, "none", GREY, "", 0.12),
         (CURRENT, "none", INK, "", 0.12),
         (PREDICTION, "none", BLUE, "without error", -0.06),
         (PREDICTION, WITH_ERROR, ORANGE, "with error", 0.06),
     ):
-        own = [
-            c
-            for c in statistics.conditions
-            if (c.condition.group, c.condition.error) == (group, error)
-        ]
+        series = (group, error)
+        own = [c for c in conditions if (c.condition.group, c.condition.error) == series]
         if not own:
             continue
         x = np.array([-1 if (h := c.condition.horizon) is None else h for c in own])
-        rate, low, high = (
-            100.0
-            * np.array(
-                [(c.success.rate, c.success.low, c.success.high) for c in own], dtype=np.float64
-            ).T
-        )
+        rates = [(c.success.rate, c.success.low, c.success.high) for c in own]
+        rate, low, high = 100.0 * np.array(rates, dtype=np.float64).T
         style: Any = {"color": color, "label": f"prediction {label}" if label else None}
         if len(x) > 1:
             axes.fill_between(x, low, high, color=color, alpha=0.18, lw=0)
             axes.plot(x, rate, "o-", **style)
         else:  # a band of one horizon has no width
             place = x + shift / 2 if label else x
-            axes.errorbar(place, rate, [rate - low, high - rate], fmt="o", capsize=4, **style)
-        there = [
-            (place + shift, 100.0 * c.published.successes / study.trials)
-            for place, c in zip(x, own, strict=True)
-            if c.published
-        ]
+            errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
+            axes.errorbar(place, rate, errors, fmt="o", capsize=4, **style)
+        there = [(h, c.published.successes) for h, c in zip(x, own, strict=True) if c.published]
         if there:
-            style = {"mfc": "none", "mec": color, "ms": 6, "ls": "none"}
-            theirs = f"paper, {label}" if label else None
-            axes.plot(*zip(*there, strict=True), marker="D", label=theirs, **style)
+            places, successes = np.array(there, dtype=np.float64).T
+            style = {"mfc": "none", "mec": color, "ms": 6, "ls": "none", "marker": "D"}
+            style["label"] = f"paper, {label}" if label else None
+            axes.plot(places + shift, 100.0 * successes / study.trials, **style)
         last = max(last, *x)
     ticks = range(-1, last + 1)
     axes.set_xticks(ticks, ["baseline", "current", *map(str, ticks[2:])])
@@ -207,7 +198,7 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
     caption = f"Bands and bars: 95 % intervals{seeds}."
     if _has_published(statistics):
         caption += f" Hollow markers: {_paper(study.success_table)}, {study.trials} episodes each."
-    best = max(statistics.conditions, key=lambda c: c.success.rate or 0.0)
+    best = max(conditions, key=lambda c: c.success.rate or 0.0)
     return caption, f"The highest rate is that of “{best.condition.label}”, {best.success}."
 
 

@@ -190,7 +190,6 @@ def analyze(
     require_choice("reference condition", reference, grouped)
     study = task.load_study()
     outcomes = {name: outcome_matrix(own) for name, own in grouped.items()}
-
     limit = task.success_time_limit
 
     def rng(name: str, measure: str) -> np.random.Generator:
@@ -237,9 +236,7 @@ def analyze(
     claims = [claim for claim in study.claims if set(claim.weights) <= set(outcomes)]
     findings = tuple(_finding(claim, study, outcomes, seed, resamples) for claim in claims)
     seeds = set.intersection(*(own.complete_seeds for own in outcomes.values()))
-    return BenchmarkStatistics(
-        task, study, tuple(found), reference, tuple(sorted(seeds)), findings
-    )
+    return BenchmarkStatistics(task, study, tuple(found), reference, tuple(sorted(seeds)), findings)
 
 
 def _generator(seed: int, text: str) -> np.random.Generator:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product, starmap
 
 from robo_manip_baselines.observation import (
     ERRORS,
@@ -99,38 +100,26 @@ def sort_conditions(
         conditions: in any order.
         given: names in the order of whoever declared them.
     """
-
-    def place(
-        condition: ConditionDescription,
-    ) -> tuple[int, int, float, bool, str, int, str]:
-        is_declared = condition.group == FURTHER and condition.name in given
-        return (
-            GROUPS.index(condition.group),
-            given.index(condition.name) if is_declared else len(given),
-            math.inf if condition.horizon is None else condition.horizon,
-            condition.error != "none",
-            condition.error,
-            condition.delay,
-            condition.name,
-        )
-
-    return sorted(conditions, key=place)
+    return sorted(
+        conditions,
+        key=lambda c: (
+            GROUPS.index(c.group),
+            given.index(c.name) if c.group == FURTHER and c.name in given else len(given),
+            math.inf if c.horizon is None else c.horizon,
+            *(c.error != "none", c.error, c.delay, c.name),
+        ),
+    )
 
 
 @cache
 def _specs_by_name() -> dict[str, ObservationSpec]:
-    delays = range(MAX_DELAY + 1)
-    specs = [
-        ObservationSpec("baseline"),
-        *(_spec_with("current", 1, "none", delay) for delay in delays),
-        *(
-            _spec_with("current_pred", horizon, error, delay)
-            for horizon in range(1, MAX_HORIZON + 1)
-            for error in ERRORS
-            for delay in delays
-        ),
+    horizons, delays = range(1, MAX_HORIZON + 1), range(MAX_DELAY + 1)
+    shown = [
+        ("baseline", 1, "none", 0),
+        *product(["current"], [1], ["none"], delays),
+        *product(["current_pred"], horizons, ERRORS, delays),
     ]
-    return {spec.name: spec for spec in specs}
+    return {spec.name: spec for spec in starmap(_spec_with, shown)}
 
 
 def _spec_with(obs: str, horizon: int, error: str, delay: int) -> ObservationSpec:

@@ -272,9 +272,7 @@ def published_success(
     return Comparison(Estimate(mean, float(ends[0]), float(ends[1]), episodes), float(test.pvalue))
 
 
-def published_time(
-    times: Floats, published: PublishedResult | None, rounding: float
-) -> Comparison:
+def published_time(times: Floats, published: PublishedResult | None, rounding: float) -> Comparison:
     """Compare a mean completion time with a published one that comes without a spread.
 
     Published times are assumed to spread as ours do, over as many successes as are published:

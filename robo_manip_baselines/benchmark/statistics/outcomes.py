@@ -118,8 +118,8 @@ class OutcomeMatrix:
     @property
     def complete_seeds(self) -> set[int]:
         """Evaluation seeds that every training seed has."""
-        is_complete = np.isfinite(self.success).all(axis=0)
-        return {seed for seed, complete in zip(self.seeds, is_complete, strict=True) if complete}
+        is_there = np.isfinite(self.success)
+        return {seed for column, seed in enumerate(self.seeds) if is_there[:, column].all()}
 
     def success_within(self, limit: float) -> Floats:
         """Return (R, E) 1 or 0: success with a completion time of at most ``limit`` s."""

@@ -122,18 +122,28 @@ class Statistic:
         else:
             getters = [attrgetter(path) for path in self.values.split()]
             values = [tuple(get(c) for get in getters) for c in conditions]
-        first = [value[0] for value in values if value[0] is not None]
+        found = [value[0] for value in values if value[0] is not None]
         return [
-            Cell(NOTHING, value)
-            if value[0] is None
-            else Cell(
-                self.text(*value),
+            make_cell(
                 value,
+                self.text,
                 None if self.rows is None else RowSelection(c.condition.name, **self.rows),
-                self.strong is not None and self.strong(value[0], first),
+                lambda value: self.strong is not None and self.strong(value, found),
             )
             for c, value in zip(conditions, values, strict=True)
         ]
+
+
+def make_cell(
+    values: tuple[Any, ...],
+    text: Callable[..., str],
+    rows: RowSelection | None = None,
+    is_strong: Callable[[Any], bool] = lambda value: False,
+) -> Cell:
+    """Make a cell; empty, without result rows, where the first value is None."""
+    if values[0] is None:
+        return Cell(NOTHING, values)
+    return Cell(text(*values), values, rows, is_strong(values[0]))
 
 
 ALL: dict[str, Any] = {}
@@ -212,18 +222,16 @@ def findings_table(statistics: BenchmarkStatistics) -> Table:
         first, *others = claim.weights
         rows = RowSelection(first, is_success=None if is_success else True, versus=tuple(others))
 
-        def number(value: float | None, rows: RowSelection | None) -> Cell:
-            return Cell(NOTHING if value is None else f"{text(value)} {unit}", (value,), rows)
+        def number(value: float) -> str:
+            return f"{text(value)} {unit}"
 
         cells = (
-            Cell(claim.text, (claim.text,)),
-            number(theirs, None),
-            number(d.mean, rows),
-            Cell(NOTHING, (None, None))
-            if d.low is None or d.high is None
-            else Cell(_ends(text)(d.low, d.high), (d.low, d.high), rows),
-            Cell(str(d.n), (d.n,), rows),
-            Cell(finding.verdict, (finding.verdict,), is_strong=True),
+            make_cell((claim.text,), str),
+            make_cell((theirs,), number),
+            make_cell((d.mean,), number, rows),
+            make_cell((d.low, d.high), _ends(text), rows),
+            make_cell((d.n,), str, rows),
+            make_cell((finding.verdict,), str, is_strong=bool),
         )
         return Row("Further claims" if theirs is None else "The paper's claims", cells)
 
