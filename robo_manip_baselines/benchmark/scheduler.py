@@ -52,18 +52,23 @@ class Executor(Protocol):
 
     def has_room(self, item: WorkItem) -> bool:
         """Whether an item can be started now."""
+        ...
 
     def workers(self, threads: int, gpus: float) -> int:
         """Return how many items that need so much run at once."""
+        ...
 
     def start(self, item: WorkItem) -> None:
         """Start an item whose needs are done."""
+        ...
 
     def wait(self) -> Iterable[WorkResult]:
         """Wait for results, for half a second at most."""
+        ...
 
     def close(self) -> None:
         """End all running items, which can be continued later."""
+        ...
 
 
 class LocalExecutor:
