@@ -38,7 +38,8 @@ class BenchmarkPreset:
         num_episodes: evaluation episodes of each trained policy, seeds from 1000.
         episode_block: of them in a work item.
         train_seeds: trainings of each condition, seeds from 0.
-        train_settings: settings of the training that differ from the policy's preset.
+        train_settings: settings of the training that differ from the policy's preset; those that a
+            policy does not have are left out.
         num_envs: evaluation episodes that run at once in a work item.
         device: of networks, ``cpu`` or ``cuda``.
         threads: CPU threads of each work item, whatever the number of workers: another number would
@@ -210,19 +211,20 @@ class Plan:
         self, condition: ConditionConfig, train_seed: int, demonstrations: tuple[WorkItem, ...]
     ) -> PlannedRun:
         preset = self.preset
-        settings = {
-            "policy": condition.policy,
-            "preset": preset.train_preset,
-            "env": self.env,
-            **preset.train_settings,
+        default = TrainConfig.from_preset(condition.policy, preset.train_preset, env=self.env)
+        known = default.to_json()
+        settings = {name: v for name, v in preset.train_settings.items() if name in known}
+        settings |= {
             "seed": train_seed,
             "device": preset.device,
             "logger": "none",
             "dataset": MOUNTS["demonstrations"],
             "out": OUT,
         }
-        config = TrainConfig.from_json(settings)
+        config = TrainConfig.from_json({**known, **settings})
         spec = condition.observation(config.spec)
+        if not task_entry(self.env).names.objects:
+            spec = replace(spec, object_pose=False)
         files = self._files()
         if self.error_stats and spec.corruption.error in MEASURED_ERRORS:
             spec = replace(spec, corruption=replace(spec.corruption, error_stats=STATS))

@@ -34,7 +34,7 @@ EXAMPLE = "python bin/Train.py Act --obs current_pred --horizon 2 --seed 0"
 
 
 @dataclass(frozen=True)
-class TrainOptions(Generic[Network]):
+class TrainCommandOptions(Generic[Network]):
     """Train a policy on demonstrations."""
 
     run: tyro.conf.OmitArgPrefixes[TrainConfig[Network]]
@@ -69,7 +69,7 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     preset = _last_value(args, "preset") or str(values.get("preset", "auto"))
     if preset == "auto":
         preset = _auto_preset(list(presets), False if is_help else has_gpu, is_quiet=is_help)
-    options = TrainOptions(TrainConfig.from_preset(policy, preset))
+    options = TrainCommandOptions(TrainConfig.from_preset(policy, preset))
     options = _with_budget(options, values)
     if file:
         options = _apply_yaml(file, {**values, "preset": preset}, options)
@@ -88,8 +88,10 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     return config
 
 
-def _parse(options: TrainOptions[Any], args: list[str], description: str) -> TrainOptions[Any]:
-    kind: Any = TrainOptions[type(options.run.network)]
+def _parse(
+    options: TrainCommandOptions[Any], args: list[str], description: str
+) -> TrainCommandOptions[Any]:
+    kind: Any = TrainCommandOptions[type(options.run.network)]
     return parse(kind, EXAMPLE, description=description, args=args, default=options)
 
 
@@ -108,7 +110,9 @@ def _auto_preset(presets: Sequence[str], has_gpu: bool | None, *, is_quiet: bool
     return name
 
 
-def _with_budget(options: TrainOptions[Any], given: Mapping[str, Any]) -> TrainOptions[Any]:
+def _with_budget(
+    options: TrainCommandOptions[Any], given: Mapping[str, Any]
+) -> TrainCommandOptions[Any]:
     """Let the one budget that is given, epochs or steps, replace the other's default."""
     named = [name for name in ("epochs", "steps") if given.get(name) not in (None, "None")]
     if len(named) != 1:
@@ -119,8 +123,8 @@ def _with_budget(options: TrainOptions[Any], given: Mapping[str, Any]) -> TrainO
 
 
 def _apply_yaml(
-    file: Path, values: Mapping[str, Any], options: TrainOptions[Any]
-) -> TrainOptions[Any]:
+    file: Path, values: Mapping[str, Any], options: TrainCommandOptions[Any]
+) -> TrainCommandOptions[Any]:
     """Parse a file's values as if they had been typed, so that they are checked the same way."""
     known = [*options.run.to_json(), "corruption"]
     args = [options.run.policy]

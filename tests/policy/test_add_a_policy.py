@@ -24,7 +24,7 @@ from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.errors import RequestError
 
 SHORT = {
-    "--scripted": "--num_episodes 4 --preview 0 --workers 0",
+    "--scripted": "--num_episodes 4 --preview 0 --workers 1",
     "Train.py": "--steps 20 --batch_size 8 --hidden_size 16 --warmup_steps 2 --ema_decay 0.5 "
     "--logger none --device cpu --validation_fraction 0.3 --validate_every 10",
     "--policy": "--num_episodes 1 --workers 0 --device cpu",
