@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -60,8 +61,8 @@ def test_evaluates_and_carries_on(
     once, pieces = tmp_path / "once", tmp_path / "pieces"
     main(command_line(run_folder, out=once))
     table = capsys.readouterr().out
-    assert "success           0/3  0.0% (95 % interval 0.0% to 56.1%)" in table
-    assert "failures          never_grasped 3" in table
+    assert re.search(r"^success +0/3  0\.0% \(95 % interval 0\.0% to 56\.1%\)$", table, re.M)
+    assert re.search(r"^failures +never_grasped 3$", table, re.M)
     results = read_results(once)
     assert [result.seed for result in results] == [1000, 1001, 1002]
     assert {(r.policy, r.condition, r.train_seed, r.steps) for r in results} == {
@@ -80,7 +81,7 @@ def test_evaluates_and_carries_on(
     # Nothing left to do: the same table, nothing rewritten differently.
     capsys.readouterr()
     main(command_line(run_folder, out=pieces))
-    assert "speed             -" in capsys.readouterr().out
+    assert re.search(r"^speed +-$", capsys.readouterr().out, re.M)
 
 
 def test_results_of_another_execution_are_not_mixed(run_folder: Path, tmp_path: Path) -> None:
