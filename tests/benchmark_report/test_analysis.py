@@ -69,7 +69,7 @@ def test_rows_of_many_files(tmp_path: Path, make_rows: MakeRows) -> None:
     with pytest.raises(RequestError, match=r"training seed 0, seed 1000 is also in .*line 1"):
         read_result_rows([files[0], files[0]])
     files[0].write_text('{"seed": 1}\n')
-    with pytest.raises(RequestError, match=r"row 1 is damaged: 'env' is missing"):
+    with pytest.raises(RequestError, match=r"line 1 is damaged: 'env' is missing"):
         read_result_rows(files)
     with pytest.raises(RequestError, match="cannot be read"):
         read_result_rows([tmp_path / "none.jsonl"])
@@ -162,8 +162,10 @@ def test_intervals_do_not_depend_on_other_conditions(
         one, other = alone.of(name), statistics.of(name)
         assert one.time == other.time
         assert one.success == other.success
-        assert one.success_difference.difference == other.success_difference.difference
-        assert one.success_difference.p == other.success_difference.p
+        # The correction depends on the number of conditions, as it should.
+        assert replace(one.success_difference, p_holm=None) == replace(
+            other.success_difference, p_holm=None
+        )
 
 
 def test_reference(make_rows: MakeRows) -> None:

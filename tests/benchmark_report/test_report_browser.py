@@ -261,7 +261,7 @@ def test_numbers_open_as_many_rows_as_they_say(opened: Opened) -> None:
         assert opened.count(link(episodes.selection)) == conditions * episodes.values[0]  # type: ignore[arg-type,operator]
 
 
-def test_a_click_opens_lines_that_say_where_they_stand(opened: Opened) -> None:
+def test_a_click_opens_rows_with_their_place(opened: Opened) -> None:
     page, statistics = opened.page, opened.statistics
     page.locator("#table-failures tbody tr").first.locator("td").nth(1).get_by_role("link").click()
     first = page.locator("#rows tbody tr").first
@@ -277,7 +277,7 @@ def test_a_click_opens_lines_that_say_where_they_stand(opened: Opened) -> None:
     page.locator("#rows thead button", has_text="Time").click()
     times = [float(t) for t in page.locator("#rows tbody td:nth-child(7)").all_inner_texts()]
     assert times == sorted(times)
-    page.locator("#rows thead button", has_text="ResultRow").click()
+    page.locator("#rows thead button", has_text="Row").click()
     places = page.locator("#rows tbody td:nth-child(1)").all_inner_texts()
     numbers = [int(place.rpartition(":")[2]) for place in places]
     assert numbers == sorted(numbers)
