@@ -1,4 +1,4 @@
-"""How well the scripted experts feed: outcomes, forces and slip, expert by expert, clip by clip.
+"""Scripted experts of feeding: success, forces and slip, expert by expert, clip by clip.
 
 Example: python benchmarks/experts.py --num_episodes 50
 """
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import mink
 import numpy as np
 
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS, FeedingExpert
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 from robo_manip_baselines.runs.command import parse, run_command
@@ -21,7 +21,7 @@ from robo_manip_baselines.runs.errors import RequestError
 
 @dataclass(frozen=True)
 class Options:
-    """Play episodes with every scripted expert and print what came of them."""
+    """Run episodes of every scripted expert and print their results."""
 
     num_episodes: int = 50
     """Episodes of each expert, one for each seed from --seed on."""
@@ -32,11 +32,11 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ExpertEpisode:
     """One episode.
 
     Attributes:
-        clip: whose motion it was.
+        clip: recorded clip whose motion the face replayed.
         is_success, is_success_strict: as in ``info``.
         touched_face: the gripper touched lips or face after the lift.
         released_inside: the cube was let go in the mouth.
@@ -56,9 +56,9 @@ class Outcome:
     force: float
 
 
-def play(world: FeedingEnv, expert: str, seed: int) -> Outcome:
-    """Play one episode."""
-    actor = FeedingExpert(world, EXPERTS[expert])
+def play(world: FeedingEnv, expert: str, seed: int) -> ExpertEpisode:
+    """Run one episode."""
+    actor = ENTRY.make_expert(expert, world)
     world.reset(seed=seed)
     actor.reset()
     force, carried = 0.0, []
@@ -67,13 +67,11 @@ def play(world: FeedingEnv, expert: str, seed: int) -> Outcome:
         force = max(force, info["face_force"])
         if world.progress.phase is Phase.CARRY:
             gripper = mink.SO3(world.gripper_orientation)
-            carried.append(
-                gripper.inverse().apply(world.object_position() - world.gripper_position)
-            )
+            carried.append(gripper.inverse().apply(world.cube_position - world.gripper_position))
         if terminated:
             break
     time = world.progress.completion_time
-    return Outcome(
+    return ExpertEpisode(
         seed=seed,
         clip=world.segment.clip,
         is_success=world.progress.is_success,
@@ -86,7 +84,7 @@ def play(world: FeedingEnv, expert: str, seed: int) -> Outcome:
     )
 
 
-def table(name: str, outcomes: dict[str, list[Outcome]]) -> Iterator[str]:
+def table(name: str, outcomes: dict[str, list[ExpertEpisode]]) -> Iterator[str]:
     """Lay outcomes out as Markdown, a row for each group."""
     heads = [name, "success", "strict", "touched face", "let go outside", "completion time (s)"]
     heads += ["slip (mm)", "force (N)", "failed"]
@@ -110,7 +108,7 @@ def table(name: str, outcomes: dict[str, list[Outcome]]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Play and print."""
+    """Run and print."""
     options: Options = parse(Options, "python benchmarks/experts.py --num_episodes 50")
     if options.num_episodes < 1:
         raise RequestError(f"num_episodes {options.num_episodes}: must be 1 or more")
@@ -118,7 +116,7 @@ def main() -> None:
     assert isinstance(env.unwrapped, FeedingEnv)
     seeds = range(options.seed, options.seed + options.num_episodes)
     by_expert = {
-        expert: [play(env.unwrapped, expert, seed) for seed in seeds] for expert in EXPERTS
+        expert: [play(env.unwrapped, expert, seed) for seed in seeds] for expert in ENTRY.experts
     }
     env.close()
     print("\n".join(table("expert", by_expert)), end="\n\n")

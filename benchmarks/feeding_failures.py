@@ -1,4 +1,4 @@
-"""Failures of a benchmark's conditions in the same episodes, and how much recorded mouths move.
+"""Failures of the conditions of a benchmark: shared episodes, distance from success, mouth motion.
 
 python benchmarks/feeding_failures.py docs/results/feeding-cpu/results.jsonl
 """
@@ -12,32 +12,32 @@ from pathlib import Path
 
 import numpy as np
 
-from robo_manip_baselines.benchmark.statistics.outcomes import read_result_rows
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
-from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.rollout.results import EpisodeResult, read_rows
 
 BLIND = "baseline"
-"""Condition that knows nothing of the mouth where there are no images."""
+"""Condition that does not observe the mouth where there are no images."""
 
 SHORT = 0.006
 """m beyond the tolerance along x at which a gripper that aims well has nearly arrived."""
 
 MANY = 8
-"""Conditions that fail in an episode from which it is called hard."""
+"""Failing conditions from which an episode is called hard."""
 
 
 def is_short(result: EpisodeResult) -> bool:
-    """Whether the gripper let go in front of the mouth, just beyond the tolerance."""
-    if result.failure != "dropped" or result.columns["closest_offset"] is None:
+    """Return whether the gripper let go in front of the mouth, just beyond the tolerance."""
+    offset = result.columns["closest_offset"]
+    if result.failure != "dropped" or offset is None:
         return False
-    out, *beside = np.abs(result.columns["closest_offset"])
+    out, *beside = np.abs(offset)
     limit, *tolerance = MOUTH_TOLERANCE
     return bool(limit <= out < limit + SHORT and np.less(beside, tolerance).all())
 
 
 def failures(results: Sequence[EpisodeResult]) -> None:
-    """Print in which episodes conditions fail, and how many let go just in front of the mouth."""
+    """Print the episodes in which conditions fail, and the drops just in front of the mouth."""
     seeing = [r for r in results if r.condition != BLIND]
     failed = Counter(r.seed for r in seeing if not r.is_success)
     hard = [count for count in failed.values() if count >= MANY]
@@ -60,8 +60,8 @@ def failures(results: Sequence[EpisodeResult]) -> None:
 
 
 def motion(library: MotionLibrary) -> None:
-    """Print how far recorded mouths move within a horizon."""
-    print("frames  median  90th percentile of how far the mouth moves, mm")
+    """Print the distance that recorded mouths move within a horizon."""
+    print("frames  median  90th percentile of the distance that the mouth moves, mm")
     for frames in (1, 2, 3, 4, 5, 8):
         moves = []
         for start, length in zip(library.run_start, library.run_length, strict=True):
@@ -77,7 +77,7 @@ def main() -> None:
     parser.add_argument("results", type=Path, help="a results.jsonl of bin/Benchmark.py")
     parser.add_argument("--motion_library", type=Path, help="the shipped one if not given")
     options = parser.parse_args()
-    failures([row.result for row in read_result_rows([options.results])])
+    failures(read_rows(options.results))
     motion(MotionLibrary.load(options.motion_library))
 
 

@@ -1,4 +1,4 @@
-"""What an observation's three camera images cost, next to the public ALOHA cell's.
+"""Cost of an observation's three camera images, next to the public ALOHA cell's.
 
 Measures, in one run on one machine and in turns: the three cameras of FeedingEnv as a policy sees
 them, the same with shadows and multisampling, and the cameras ``top``, ``angle`` and
@@ -47,7 +47,7 @@ Draw = Callable[[], object]
 
 @dataclass(frozen=True)
 class Options:
-    """Measure what three camera images cost, here and in the public ALOHA cell.
+    """Measure the cost of three camera images, here and in the public ALOHA cell.
 
     Attributes:
         rounds: how often each set of three images is drawn, in turns.

@@ -1,61 +1,62 @@
-"""Arms of a benchmark: lines of a YAML file."""
+"""Conditions of a benchmark: entries of a YAML file.
+
+The keys of an entry are those of `ConditionConfig`, and the settings of `ObservationSpec` and
+`Corruption` under the names of their options.
+"""
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Sequence
+import typing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from robo_manip_baselines.benchmark.forecasts import FORECASTS
-from robo_manip_baselines.benchmark.statistics.conditions import Arm, arm_of
-from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS
-from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import PAPER
-from robo_manip_baselines.envs.mujoco.tasks.registry import ENVS
+from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.policy.registry import policy_entry
-from robo_manip_baselines.rollout.evaluation import arm_name
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
-ARMS = Path(str(files("robo_manip_baselines.benchmark") / "arms"))
+CONDITIONS = Path(str(files("robo_manip_baselines.benchmark") / "conditions"))
 """Folder of the files that ship with the package; a benchmark is named after its file."""
 
+PUBLISHED = "published"
+"""In place of a list of names: the conditions whose results the task's paper reports."""
+
+_DEFAULT_SPEC = ObservationSpec("current_pred", cameras=())
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_TYPE_NAMES = {str: "text", int: "a whole number", float: "a number"}
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class ArmLine:
-    """An arm: what is demonstrated, what the policy is shown, and which policy it is.
+class ConditionConfig:
+    """Experimental condition: demonstrations, policy and observations.
 
     Attributes:
-        name: as in ``results.jsonl``: letters, digits, ``_``, ``-`` and ``.``.
-        policy: which one, for example ``Act``.
-        obs, horizon: see `ObservationSpec`.
-        error, delay, face_dropout, face_dropout_length, detector_rate, corruption_seed: what
-            stands between truth and policy in training and in evaluation, see `Corruption`;
-            None is as if nothing were said.
-        prediction: ``truth``, or a forecast in its place, see `forecasts`.
-        expert: who demonstrates, ``reactive`` or ``anticipatory``.
-        title: in tables and plots; from the name if empty.
+        name: in ``results.jsonl``: letters, digits, ``_``, ``-`` and ``.``.
+        policy: for example ``Act``.
+        spec: observations in training and evaluation; their cameras, objects and arms are those of
+            the benchmark's preset.
+        prediction: future of the target in observations: ``truth``, or a forecast in its place, see
+            `forecasts`.
+        expert: of the demonstrations; the task's default if empty.
+        title: in tables and figures; made from the observations if empty.
 
     Raises:
-        RequestError: a value that is not valid.
+        RequestError: a value is not valid.
     """
 
     name: str
     policy: str = "Act"
-    obs: str = "current_pred"
-    horizon: int = 2
-    error: str = "none"
-    delay: int | None = None
-    face_dropout: float | None = None
-    face_dropout_length: float | None = None
-    detector_rate: float | None = None
-    corruption_seed: int | None = None
+    spec: ObservationSpec = _DEFAULT_SPEC
     prediction: str = "truth"
-    expert: str = "reactive"
+    expert: str = ""
     title: str = ""
 
     def __post_init__(self) -> None:
@@ -65,139 +66,167 @@ class ArmLine:
                 "current_pred_h2_delay3"
             )
         policy_entry(self.policy)
-        require_choice("expert", self.expert, EXPERTS)
         require_choice("prediction", self.prediction, ("truth", *FORECASTS))
-        if self.prediction != "truth" and (self.obs != "current_pred" or self.error != "none"):
+        spec = self.spec
+        if self.prediction != "truth" and (
+            spec.obs != "current_pred" or spec.corruption.error != "none"
+        ):
             raise RequestError(
                 f"prediction '{self.prediction}' goes with obs current_pred and without an error; "
                 "leave the other out"
             )
-        spec = ObservationSpec(self.obs, self.horizon, cameras=(), corruption=self._corruption())
-        is_plain = self.prediction == "truth" and self.expert == "reactive"
-        if self.name in PAPER and not (is_plain and arm_name(spec) == self.name):
+
+    @classmethod
+    def from_yaml(cls, values: Any) -> ConditionConfig:
+        """Make a condition of an entry of a file.
+
+        Raises:
+            RequestError: a key or a value is not valid.
+        """
+        if not isinstance(values, dict):
+            raise RequestError("a condition is a mapping such as {name: current, obs: current}")
+        given: dict[type, dict[str, Any]] = {cls: {}, ObservationSpec: {}, Corruption: {}}
+        for key, value in values.items():
+            owner, name, kind = _KEYS[require_choice("key of a condition", str(key), _KEYS)]
+            accepted = (int, float) if kind is float else kind
+            if not isinstance(value, accepted) or isinstance(value, bool):
+                raise RequestError(f"{key} must be {_TYPE_NAMES[kind]}, not {value!r}")
+            given[owner][name] = value
+        if "name" not in values:
+            raise RequestError("the condition has no name; add 'name: ...'")
+        corruption = Corruption(**given[Corruption])
+        spec = replace(_DEFAULT_SPEC, **given[ObservationSpec], corruption=corruption)
+        return cls(**given[cls], spec=spec)
+
+    def for_task(self, task: TaskEntry) -> ConditionConfig:
+        """Return the condition with the task's default expert, if none is given.
+
+        Raises:
+            RequestError: the task has no such expert, or its paper has another condition of that
+                name.
+        """
+        default, *_ = task.experts
+        expert = require_choice("expert", self.expert or default, task.experts)
+        is_plain = self.prediction == "truth" and expert == default
+        if self.name in task.load_study().published and not (
+            is_plain and self.spec.name == self.name
+        ):
             raise RequestError(
-                f"the name '{self.name}' is that of an arm of the paper, with which it would be "
-                "compared, and these settings are others; choose another name"
+                f"the name '{self.name}' is that of a condition of the paper, with which it would "
+                "be compared, and these settings are others; choose another name"
             )
+        return replace(self, expert=expert)
 
-    @property
-    def shown_error(self) -> str:
-        """The error as `bin/Train.py` is told it; forecasts travel as those of a predictor."""
-        return "model" if self.prediction != "truth" else self.error
-
-    @property
-    def train_args(self) -> tuple[str, ...]:
-        """What ``bin/Train.py`` is told of the arm."""
-        told: dict[str, Any] = {"obs": self.obs}
-        if self.obs == "current_pred":
-            told["horizon"] = self.horizon
-        if self.shown_error != "none":
-            told["error"] = self.shown_error
-        for name in _DETECTION:
-            told[name] = getattr(self, name)
-        return tuple(
-            part
-            for name, value in told.items()
-            if value is not None
-            for part in (f"--{name}", str(value))
-        )
-
-    @property
-    def described(self) -> Arm:
-        """The arm as tables and plots show it."""
-        known = arm_of(self.name)
-        return replace(known, label=self.title) if self.title else known
-
-    def _corruption(self) -> Corruption:
-        given = {name: getattr(self, name) for name in _DETECTION}
-        given["seed"] = given.pop("corruption_seed")
-        known = {name: value for name, value in given.items() if value is not None}
-        return Corruption(error=self.shown_error, **known)
+    def observation(self, preset: ObservationSpec) -> ObservationSpec:
+        """Return the spec of the policy: a preset's with the condition's settings in it."""
+        corruption = self.spec.corruption
+        if self.prediction != "truth":  # forecasts are recorded as a predictor's output is
+            corruption = replace(corruption, error="model")
+        return replace(preset, obs=self.spec.obs, horizon=self.spec.horizon, corruption=corruption)
 
 
-_DETECTION = ("delay", "face_dropout", "face_dropout_length", "detector_rate", "corruption_seed")
-"""Settings of the corruption beside the error, named as ``bin/Train.py`` spells them."""
-
-_TYPES = {
-    "horizon": (int,),
-    "delay": (int,),
-    "corruption_seed": (int,),
-    "face_dropout": (int, float),
-    "face_dropout_length": (int, float),
-    "detector_rate": (int, float),
-}
-"""Types of the values that are no words."""
+_NOT_OF_A_CONDITION = (
+    *("cameras", "image_size", "object_pose", "arms", "corruption"),  # of the preset
+    *("error_stats", "stats_sha256"),  # one file for all conditions
+)
 
 
-def read_arms(path: Path) -> tuple[str, tuple[ArmLine, ...]]:
-    """Read a file of arms.
+def _find_keys() -> dict[str, tuple[type, str, type]]:
+    """Map each key of an entry to its class, its field and the type of its value."""
+    keys: dict[str, tuple[type, str, type]] = {}
+    for owner in (ConditionConfig, ObservationSpec, Corruption):
+        hints = typing.get_type_hints(owner)
+        for name in (item.name for item in fields(owner)):
+            key = "corruption_seed" if (owner, name) == (Corruption, "seed") else name
+            accepted = (hints[name], *typing.get_args(hints[name]))
+            kinds = [kind for kind in _TYPE_NAMES if kind in accepted]
+            if kinds and name not in _NOT_OF_A_CONDITION:
+                keys[key] = owner, name, kinds[0]
+    return keys
 
-    Returns:
-        The name of the environment, and the arms in their order.
+
+_KEYS = _find_keys()
+
+
+@dataclass(frozen=True)
+class ConditionFile:
+    """Contents of a file of conditions.
+
+    Attributes:
+        env: name of the task.
+        conditions: in their order.
+        presets: name of a preset -> names of its conditions; others have all of them.
+    """
+
+    env: str
+    conditions: tuple[ConditionConfig, ...]
+    presets: Mapping[str, tuple[str, ...]]
+
+    def choose(self, names: Sequence[str]) -> tuple[ConditionConfig, ...]:
+        """Return the conditions of these names, in the order of the file.
+
+        Raises:
+            RequestError: there is no such condition.
+        """
+        known = [condition.name for condition in self.conditions]
+        wanted = {require_choice("condition", name, known) for name in names}
+        return tuple(condition for condition in self.conditions if condition.name in wanted)
+
+
+def read_conditions(path: Path) -> ConditionFile:
+    """Read a file of conditions.
 
     Raises:
-        RequestError: the file cannot be read, or something in it is not valid; names the line.
+        RequestError: the file cannot be read, or an entry is not valid; the message names its line.
     """
-    # Imported here: what needs no arms needs no YAML either.
-    import yaml
+    import yaml  # slow to import
 
     try:
         text = path.read_text(encoding="utf-8")
-        content = yaml.safe_load(text)
+        content, node = yaml.safe_load(text), yaml.compose(text, yaml.SafeLoader)
     except OSError as error:
         raise RequestError(f"cannot read '{path}': {error.strerror or error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise RequestError(f"'{path}' is no YAML: {error}") from error
-    if not isinstance(content, dict) or not isinstance(content.get("arms"), list):
-        raise RequestError(f"'{path}' must hold 'env: FeedingEnv' and a list 'arms:'")
-    lines = _line_numbers(yaml.compose(text, yaml.SafeLoader))
+    key = "conditions"
+    if isinstance(content, dict) and "arms" in content and key not in content:
+        key = "arms"
+        logger.info("'%s': 'arms:' is called 'conditions:' now; both are read", path)
+    if not isinstance(content, dict) or not isinstance(content.get(key), list):
+        raise RequestError(f"'{path}' must hold 'env: FeedingEnv' and a list 'conditions:'")
+    if not content[key]:
+        raise RequestError(
+            f"'{path}' has no conditions; give a line such as '- {{name: current, ...}}'"
+        )
+    (entries,) = (value.value for name, value in node.value if name.value == key)
+    place = ""
+    conditions: list[ConditionConfig] = []
     try:
         for name in content:
-            require_choice("entry", str(name), ("env", "arms"))
-        env = require_choice("environment", str(content.get("env", "FeedingEnv")), ENVS)
+            require_choice("entry", str(name), ("env", key, "presets"))
+        task = task_entry(str(content.get("env", "FeedingEnv")))
+        for entry, values in zip(entries, content[key], strict=True):
+            place = f", line {entry.start_mark.line + 1}"
+            condition = ConditionConfig.from_yaml(values).for_task(task)
+            if condition.name in [other.name for other in conditions]:
+                raise RequestError(
+                    f"the name '{condition.name}' is there twice; choose another one"
+                )
+            conditions.append(condition)
+        place = ""
+        presets = content.get("presets", {})
+        if not isinstance(presets, dict) or not all(
+            names == PUBLISHED or isinstance(names, list) for names in presets.values()
+        ):
+            raise RequestError(f"presets map names of presets to '{PUBLISHED}', or a list of names")
+        published = task.load_study().published
+        file = ConditionFile(
+            task.name,
+            tuple(conditions),
+            {k: tuple(published if v == PUBLISHED else v) for k, v in presets.items()},
+        )
+        for names in file.presets.values():
+            file.choose(names)
     except RequestError as error:
-        raise RequestError(f"'{path}': {error}") from None
-    arms: list[ArmLine] = []
-    for number, values in zip(lines, content["arms"], strict=True):
-        try:
-            arm = _to_arm(values)
-            if arm.name in [other.name for other in arms]:
-                raise RequestError(f"the name '{arm.name}' is there twice; choose another one")
-        except RequestError as error:
-            raise RequestError(f"'{path}', line {number}: {error}") from None
-        arms.append(arm)
-    if not arms:
-        raise RequestError(f"'{path}' has no arms; give a line such as '- {{name: current, ...}}'")
-    return env, tuple(arms)
-
-
-def choose_arms(arms: Sequence[ArmLine], names: Sequence[str]) -> tuple[ArmLine, ...]:
-    """Return the arms of these names, in the order of the file.
-
-    Raises:
-        RequestError: there is no such arm.
-    """
-    known = [arm.name for arm in arms]
-    wanted = {require_choice("arm", name, known) for name in names}
-    return tuple(arm for arm in arms if arm.name in wanted)
-
-
-def _to_arm(values: Any) -> ArmLine:
-    if not isinstance(values, dict):
-        raise RequestError("an arm is a mapping such as {name: current, obs: current}")
-    known = [field.name for field in fields(ArmLine)]
-    for name, value in values.items():
-        require_choice("key of an arm", str(name), known)
-        wanted = _TYPES.get(name, (str,))
-        if not isinstance(value, wanted) or isinstance(value, bool):
-            what = {(str,): "text", (int,): "a whole number"}.get(wanted, "a number")
-            raise RequestError(f"{name} must be {what}, not {value!r}")
-    if "name" not in values:
-        raise RequestError("the arm has no name; add 'name: ...'")
-    return ArmLine(**values)
-
-
-def _line_numbers(node: Any) -> list[int]:
-    """Return in which line, from 1, each arm begins."""
-    (arms,) = (value for key, value in node.value if key.value == "arms")
-    return [arm.start_mark.line + 1 for arm in arms.value]
+        raise RequestError(f"'{path}'{place}: {error}") from None
+    return file

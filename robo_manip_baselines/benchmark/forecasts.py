@@ -1,9 +1,9 @@
-"""Forecasts that stand in for the true future: what a prediction is worth that knows nothing.
+"""Forecasts without information about the future, as controls for the benefit of a prediction.
 
-They are written into a library of recorded motion in place of a predictor's output, so that the
-environment and the episode files carry them like any other prediction.
+They are written into a library of recorded motion in place of a predictor's output, so that
+environments and episode files carry them like any other prediction.
 
-Legend: N frames of the library, R runs, H = 5 frames ahead.
+Legend: N frames of the library, H = 5 frames ahead.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.face.motion import PREDICTION, MotionLibrary
 from robo_manip_baselines.observation import MAX_HORIZON
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.npz import write_npz
 
 
 def persistence(library: MotionLibrary) -> NDArray[np.float64]:
@@ -27,7 +27,7 @@ def persistence(library: MotionLibrary) -> NDArray[np.float64]:
 def shuffled(library: MotionLibrary) -> NDArray[np.float64]:
     """Forecast, (N, H, 3) m, that the mouth moves as it did half a library away.
 
-    It looks like a forecast, with the same speeds, and says nothing about the future.
+    Its speeds are those of a forecast, and it is independent of the future.
     """
     frame = np.arange(len(library.mouth))
     last = frame.copy()
@@ -59,5 +59,4 @@ def write_library(path: Path, source: Path | None, forecast: str) -> None:
     with library.source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         content = {name: archive[name] for name in archive.files}
     content[PREDICTION] = FORECASTS[forecast](library).astype(np.float32)
-    with atomic_file(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **content)
+    write_npz(path, content)

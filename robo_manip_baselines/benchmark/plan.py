@@ -1,100 +1,287 @@
-"""From arms and size to units of work."""
+"""Plan of a benchmark: conditions times the size of a preset become work items."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from robo_manip_baselines.benchmark.conditions import ArmLine
-from robo_manip_baselines.benchmark.presets import Preset
-from robo_manip_baselines.benchmark.work_item import InputFile, Unit
+from robo_manip_baselines.benchmark.conditions import ConditionConfig
+from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, WorkItem
 from robo_manip_baselines.benchmark.worker import FORECAST, LIBRARY, STATS
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.observation.error_stats import load_error_stats
-from robo_manip_baselines.rollout.evaluation import FIRST_SEED
+from robo_manip_baselines.rollout.demonstrate import Collection
+from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.training.config import TrainConfig
 
-_WORK = "robo_manip_baselines.benchmark.worker"
+_FUNCTIONS = "robo_manip_baselines.benchmark.worker"
+"""Module of the functions that do work items."""
+
+
+@dataclass(frozen=True)
+class BenchmarkPreset:
+    """Size of a benchmark: everything that is the same for all of its conditions.
+
+    Attributes:
+        train_preset: preset of the policies.
+        cameras: of the demonstrations; none shows the positions of the objects instead.
+        demonstrations: episodes of each expert, seeds from 0.
+        demonstration_block: of them in a work item.
+        num_episodes: evaluation episodes of each trained policy, seeds from 1000.
+        episode_block: of them in a work item.
+        train_seeds: trainings of each condition, seeds from 0.
+        train_settings: settings of the training that differ from the policy's preset; those that a
+            policy does not have are left out.
+        num_envs: evaluation episodes that run at once in a work item.
+        device: of networks, ``cpu`` or ``cuda``.
+        threads: CPU threads of each work item, whatever the number of workers: another number would
+            round differently.
+        gpu_share: of a GPU for each training and evaluation.
+        caution: for readers of the report; empty where none is needed.
+        has_videos: whether the report shows a success and a failure of each condition.
+        seconds: kind of work item -> expected s for each of its episodes, or for the training, as
+            measured; for the time left before any item has been done.
+
+    Raises:
+        RequestError: a value is not valid.
+    """
+
+    train_preset: str
+    cameras: tuple[str, ...]
+    demonstrations: int
+    demonstration_block: int
+    num_episodes: int
+    episode_block: int
+    train_seeds: int = 1
+    train_settings: Mapping[str, Any] = field(default_factory=dict)
+    num_envs: int = 8
+    device: str = "cpu"
+    threads: int = 1
+    gpu_share: float = 0.0
+    caution: str = ""
+    has_videos: bool = True
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("demonstrations", "num_episodes", "train_seeds"):
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
+
+
+PRESETS: dict[str, BenchmarkPreset] = {
+    # Two CPU cores, without images.
+    "cpu": BenchmarkPreset(
+        train_preset="cpu",
+        cameras=(),
+        demonstrations=50,
+        demonstration_block=25,
+        num_episodes=100,
+        episode_block=50,
+        seconds={"demonstrations": 2.0, "training": 460.0, "evaluation": 1.2, "video": 40.0},
+    ),
+    # The paper's setting (Table III, section IV.C): three cameras, 50 demonstrations, 50 episodes.
+    "paper": BenchmarkPreset(
+        train_preset="paper",
+        cameras=CAMERAS,
+        demonstrations=50,
+        demonstration_block=4,
+        num_episodes=50,
+        episode_block=10,
+        device="cuda",
+        threads=2,
+        gpu_share=0.125,
+        seconds={"demonstrations": 10.0, "training": 600.0, "evaluation": 8.0, "video": 40.0},
+    ),
+    # A check of the whole chain in three minutes, too small for any conclusion.
+    "smoke": BenchmarkPreset(
+        train_preset="cpu",
+        cameras=(),
+        demonstrations=5,
+        demonstration_block=3,
+        num_episodes=4,
+        episode_block=4,
+        train_settings={"steps": 200, "hidden_size": 64, "feedforward_size": 128},
+        caution="This size only shows that everything works: its policies have hardly learnt "
+        "anything. --preset cpu compares conditions.",
+        seconds={"demonstrations": 3.0, "training": 20.0, "evaluation": 3.0, "video": 20.0},
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """A training of an arm, and its evaluation.
+class PlannedRun:
+    """Training of a condition, and its evaluation.
 
     Attributes:
-        arm: which one.
+        condition: of the run.
         train_seed: of the training.
-        training: unit.
-        evaluations: units, in the order of their seeds.
+        training: work item.
+        evaluations: work items, in the order of their seeds.
     """
 
-    arm: ArmLine
+    condition: ConditionConfig
     train_seed: int
-    training: Unit
-    evaluations: tuple[Unit, ...]
+    training: WorkItem
+    evaluations: tuple[WorkItem, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """All units of a benchmark but the videos, which depend on its results.
+    """All work items of a benchmark but the videos, which depend on its results.
 
     Attributes:
-        env: name of the environment.
+        env: name of the task.
         preset: the size.
-        arms: in the order of the file.
-        runs: in the order of the arms, then of the training seeds.
-        library: of recorded motion, None for the one that ships with the package.
+        conditions: in the order of the file.
+        library, error_stats: files of the user; None for those that ship with the package.
     """
 
     env: str
-    preset: Preset
-    arms: tuple[ArmLine, ...]
-    runs: tuple[Run, ...]
-    library: InputFile | None
+    preset: BenchmarkPreset
+    conditions: tuple[ConditionConfig, ...]
+    library: Path | None = None
+    error_stats: Path | None = None
 
-    def units(self, shard: tuple[int, int] | None = None) -> tuple[Unit, ...]:
-        """Return the units in an order in which they can be done.
+    @cached_property
+    def runs(self) -> tuple[PlannedRun, ...]:
+        """Trainings with their evaluations, in the order of the conditions, then of the seeds."""
+        demonstrations: dict[tuple[str, str], tuple[WorkItem, ...]] = {}
+        runs: list[PlannedRun] = []
+        for condition in self.conditions:
+            variant = condition.expert, condition.prediction
+            if variant not in demonstrations:
+                demonstrations[variant] = self._demonstrations(condition)
+            for train_seed in range(self.preset.train_seeds):
+                runs.append(self._run(condition, train_seed, demonstrations[variant]))
+        return tuple(runs)
 
-        Trainings come first: the short units fill up what room is left in the end.
+    def items(self, shard: tuple[int, int] | None = None) -> tuple[WorkItem, ...]:
+        """Return the work items in order of priority, none before its needs.
+
+        Trainings precede evaluations: short items fill up the room that is left in the end.
 
         Args:
             shard: (i, n) for the i-th of n parts, i from 1: every n-th training with its evaluation
-                and all demonstrations that these need. All units if None.
+                and all demonstrations that these need. All items if None.
         """
         runs = self.runs if shard is None else self.runs[shard[0] - 1 :: shard[1]]
-        demonstrations = [unit for run in runs for unit in run.training.needs]
-        evaluations = [unit for run in runs for unit in run.evaluations]
-        units = [*demonstrations, *(run.training for run in runs), *evaluations]
-        return tuple({unit.key: unit for unit in units}.values())
+        demonstrations = [item for run in runs for item in run.training.needs]
+        evaluations = [item for run in runs for item in run.evaluations]
+        items = [*demonstrations, *(run.training for run in runs), *evaluations]
+        return tuple({item.key: item for item in items}.values())
 
-    @property
-    def video_seconds(self) -> float:
-        """Seconds that a video is expected to take."""
-        return self.preset.seconds.get("video", 30.0)
+    def video(self, result: EpisodeResult) -> WorkItem:
+        """Return the work item that runs the episode of a result once more, for a video."""
+        key = result.condition, result.train_seed or 0
+        run = next(run for run in self.runs if (run.condition.name, run.train_seed) == key)
+        name = f"{run.training.name}_{result.seed}"
+        seeds = range(result.seed, result.seed + 1)
+        return self._evaluation("video", name, seeds, run.condition, run.training)
 
-    def video(self, run: Run, result: EpisodeResult) -> Unit:
-        """Return the unit that acts an episode out once more and draws it."""
-        args = [*_evaluation_args(self, run.arm, result.seed, 1), "--video", "1"]
-        return Unit(
-            "video",
-            f"{run.arm.name}_seed{run.train_seed}_{result.seed}",
-            f"{_WORK}:evaluate",
-            {"args": args, "prediction": run.arm.prediction},
-            needs=(run.training,),
-            files=run.training.files,
+    def _demonstrations(self, condition: ConditionConfig) -> tuple[WorkItem, ...]:
+        prediction, variant = condition.prediction, condition.expert
+        env_kwargs: dict[str, Any] = {
+            "cameras": self.preset.cameras,
+            "image_size": ObservationSpec().image_size,
+            "face_motion": "episode",
+        }
+        if prediction != "truth":
+            variant += f"_{prediction}"
+            env_kwargs["motion_library"] = FORECAST
+        elif self.library:
+            env_kwargs["motion_library"] = LIBRARY
+        items = []
+        for seeds in _blocks(0, self.preset.demonstrations, self.preset.demonstration_block):
+            config = Collection(self.env, Path(OUT), condition.expert, seeds, env_kwargs)
+            name = f"{variant}_{seeds.start:06d}"
+            settings = {"config": config.to_json(), "prediction": prediction}
+            item = self._item("demonstrations", name, "demonstrate", settings, self._files())
+            items.append(replace(item, threads=1, gpus=0.0, seconds=item.seconds * len(seeds)))
+        return tuple(items)
+
+    def _run(
+        self, condition: ConditionConfig, train_seed: int, demonstrations: tuple[WorkItem, ...]
+    ) -> PlannedRun:
+        preset = self.preset
+        default = TrainConfig.from_preset(condition.policy, preset.train_preset, env=self.env)
+        known = default.to_json()
+        settings = {name: v for name, v in preset.train_settings.items() if name in known}
+        settings |= {
+            "seed": train_seed,
+            "device": preset.device,
+            "logger": "none",
+            "dataset": MOUNTS["demonstrations"],
+            "out": OUT,
+        }
+        config = TrainConfig.from_json({**known, **settings})
+        spec = condition.observation(config.spec)
+        if not task_entry(self.env).names.objects:
+            spec = replace(spec, object_pose=False)
+        files = self._files()
+        if self.error_stats and spec.corruption.error in MEASURED_ERRORS:
+            spec = replace(spec, corruption=replace(spec.corruption, error_stats=STATS))
+            files[STATS] = self.error_stats
+        config = replace(config, spec=spec)
+        name = f"{condition.name}_seed{train_seed}"
+        training = self._item("training", name, "train", {"config": config.to_json()}, files)
+        training = replace(training, needs=demonstrations)
+        evaluations = tuple(
+            self._evaluation("evaluation", f"{name}_{seeds.start:06d}", seeds, condition, training)
+            for seeds in _blocks(FIRST_SEED, preset.num_episodes, preset.episode_block)
+        )
+        return PlannedRun(condition, train_seed, training, evaluations)
+
+    def _evaluation(
+        self, kind: str, name: str, seeds: range, condition: ConditionConfig, training: WorkItem
+    ) -> WorkItem:
+        config = EvaluationConfig(
+            checkpoint=Path(MOUNTS["training"]),
+            seeds=seeds,
+            out=Path(OUT),
+            num_envs=self.preset.num_envs,
+            workers=0,
+            device=self.preset.device,
+            videos=int(kind == "video"),
+        )
+        settings = {"config": config.to_json(), "prediction": condition.prediction}
+        item = self._item(kind, name, "evaluate", settings, training.files)
+        return replace(item, needs=(training,), seconds=item.seconds * len(seeds))
+
+    def _item(
+        self,
+        kind: str,
+        name: str,
+        function: str,
+        settings: Mapping[str, Any],
+        files: Mapping[str, Path],
+    ) -> WorkItem:
+        return WorkItem(
+            kind,
+            name,
+            f"{_FUNCTIONS}:{function}",
+            settings,
+            files=files,
             threads=self.preset.threads,
             gpus=self.preset.gpu_share,
-            seconds=self.video_seconds,
+            seconds=self.preset.seconds.get(kind, 60.0),
         )
+
+    def _files(self) -> dict[str, Path]:
+        return {LIBRARY: self.library} if self.library else {}
 
 
 def make_plan(
     env: str,
-    arms: Sequence[ArmLine],
-    preset: Preset,
+    conditions: Sequence[ConditionConfig],
+    preset: BenchmarkPreset,
     *,
     library: Path | None = None,
     error_stats: Path | None = None,
@@ -102,143 +289,39 @@ def make_plan(
     """Plan a benchmark.
 
     Args:
-        env: name of the environment.
-        arms: to train and evaluate.
+        env: name of the task.
+        conditions: to train and evaluate.
         preset: the size.
         library: of recorded motion; the one that ships with the package if None.
-        error_stats: for the errors that are drawn; those that ship with the package if None.
+        error_stats: of drawn errors; those that ship with the package if None.
 
     Raises:
-        RequestError: a file cannot be used, or an arm needs predictions that the library lacks.
+        RequestError: a file cannot be used, or a condition needs predictions that the library
+            lacks.
     """
     motion = MotionLibrary.load(library)
-    for arm in arms:
-        if problem := missing_predictions(arm, motion):
+    for condition in conditions:
+        if problem := missing_predictions(condition, motion):
             raise RequestError(problem)
     load_error_stats(error_stats)
-    files = _Files(
-        library and InputFile.of(LIBRARY, library),
-        error_stats and InputFile.of(STATS, error_stats),
+    return Plan(
+        env,
+        preset,
+        tuple(condition.for_task(task_entry(env)) for condition in conditions),
+        library and library.resolve(),
+        error_stats and error_stats.resolve(),
     )
-    plan = Plan(env, preset, tuple(arms), (), files.library)
-    demonstrations: dict[tuple[str, str], tuple[Unit, ...]] = {}
-    runs: list[Run] = []
-    for arm in arms:
-        variant = arm.expert, arm.prediction
-        if variant not in demonstrations:
-            demonstrations[variant] = _demonstrations(plan, arm)
-        for train_seed in range(preset.train_seeds):
-            training = _training(plan, arm, train_seed, demonstrations[variant], files)
-            runs.append(Run(arm, train_seed, training, _evaluations(plan, arm, training)))
-    return Plan(env, preset, tuple(arms), tuple(runs), files.library)
 
 
-def missing_predictions(arm: ArmLine, library: MotionLibrary) -> str:
-    """Say so if an arm shows a predictor's output and the library has none; else nothing."""
-    if arm.error != "model" or library.predicted is not None:
+def missing_predictions(condition: ConditionConfig, library: MotionLibrary) -> str:
+    """Return why a condition lacks a predictor's output in the library; empty if it does not."""
+    if condition.spec.corruption.error != "model" or library.predicted is not None:
         return ""
     return (
-        f"arm '{arm.name}' shows a trained predictor's output, and '{library.source}' has no "
-        "predicted mouth; give a library with --motion_library that 'python -m face_prediction "
-        "predict' wrote, or do without the arm"
+        f"condition '{condition.name}' observes a trained predictor's output, and "
+        f"'{library.source}' has no predicted mouth; give a library with --motion_library that "
+        "'python -m face_prediction predict' wrote, or leave the condition out"
     )
-
-
-@dataclass(frozen=True)
-class _Files:
-    """What comes from outside the package."""
-
-    library: InputFile | None
-    error_stats: InputFile | None
-
-    def of(self, arm: ArmLine) -> tuple[InputFile, ...]:
-        """Return what training and evaluating an arm read."""
-        stats = self.error_stats if arm.error in MEASURED_ERRORS else None
-        return tuple(file for file in (self.library, stats) if file)
-
-
-def _demonstrations(plan: Plan, arm: ArmLine) -> tuple[Unit, ...]:
-    preset = plan.preset
-    variant = f"{arm.expert}_{arm.prediction}" if arm.prediction != "truth" else arm.expert
-    given = ["--motion_library", library] if (library := _library(plan, arm)) else []
-    units = []
-    for block in _blocks(0, preset.demonstrations, preset.demonstration_block):
-        args = [plan.env, "--scripted", "--expert", arm.expert, *_seeds(block), *given]
-        args += ["--cameras", *(preset.cameras or ("none",)), "--preview", "0", "--workers", "1"]
-        units.append(
-            Unit(
-                "demonstrations",
-                f"{variant}_{block.start:06d}",
-                f"{_WORK}:demonstrate",
-                {"args": [*args, "--out", "out"], "prediction": arm.prediction},
-                files=(plan.library,) if plan.library else (),
-                seconds=len(block) * preset.seconds.get("demonstration", 5.0),
-            )
-        )
-    return tuple(units)
-
-
-def _training(
-    plan: Plan, arm: ArmLine, train_seed: int, demonstrations: tuple[Unit, ...], files: _Files
-) -> Unit:
-    # Imported here: a plan is read without what training needs.
-    from robo_manip_baselines.commands.train import parse_config
-
-    preset = plan.preset
-    args = [arm.policy, "--preset", preset.train_preset, "--env", plan.env, *arm.train_args]
-    if files.error_stats and arm.error in MEASURED_ERRORS:
-        args += ["--error_stats", STATS]
-    args += ["--seed", str(train_seed), *preset.train_args, "--device", preset.device]
-    args += ["--logger", "none", "--dataset", "demonstrations", "--out", "out"]
-    return Unit(
-        "training",
-        f"{arm.name}_seed{train_seed}",
-        f"{_WORK}:train",
-        # What the options come to: another default in the preset makes another training.
-        {"args": args, "options": parse_config(args, has_gpu=False).to_json()},
-        needs=demonstrations,
-        files=files.of(arm),
-        threads=preset.threads,
-        gpus=preset.gpu_share,
-        seconds=preset.seconds.get("training", 600.0),
-    )
-
-
-def _evaluations(plan: Plan, arm: ArmLine, training: Unit) -> tuple[Unit, ...]:
-    preset = plan.preset
-    return tuple(
-        Unit(
-            "evaluation",
-            f"{training.name}_{block.start:06d}",
-            f"{_WORK}:evaluate",
-            {
-                "args": _evaluation_args(plan, arm, block.start, len(block)),
-                "prediction": arm.prediction,
-            },
-            needs=(training,),
-            files=training.files,
-            threads=preset.threads,
-            gpus=preset.gpu_share,
-            seconds=len(block) * preset.seconds.get("episode", 5.0),
-        )
-        for block in _blocks(FIRST_SEED, preset.num_episodes, preset.episode_block)
-    )
-
-
-def _evaluation_args(plan: Plan, arm: ArmLine, first: int, count: int) -> list[str]:
-    args = [plan.env, "--policy", arm.policy, "--checkpoint", "run"]
-    args += [*_seeds(range(first, first + count)), "--num_envs", str(plan.preset.num_envs)]
-    return [*args, "--workers", "0", "--device", plan.preset.device, "--out", "out"]
-
-
-def _library(plan: Plan, arm: ArmLine) -> str | None:
-    if arm.prediction != "truth":
-        return FORECAST
-    return LIBRARY if plan.library else None
-
-
-def _seeds(block: range) -> list[str]:
-    return ["--num_episodes", str(len(block)), "--seed", str(block.start)]
 
 
 def _blocks(first: int, count: int, size: int) -> list[range]:

@@ -1,238 +1,283 @@
-"""One bar over the whole grid, in units of time: what is done, and how long the rest will take."""
+"""Scheduling of work items: dependencies, an executor on this machine, and one progress bar."""
 
 from __future__ import annotations
 
 import logging
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Protocol
 
 from tqdm import tqdm
 
-from robo_manip_baselines.benchmark.work_item import Store, Unit
+from robo_manip_baselines.benchmark.work_item import LOG, ArtifactStore, WorkItem
+from robo_manip_baselines.benchmark.worker import end_worker, last_line, start_worker
 from robo_manip_baselines.runs.command import EXIT_WRONG_REQUEST
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.progress import duration
 
-FORMAT = "{percentage:3.0f}% |{bar}| {desc}"
+POLL = 0.05
+"""s between checks of the processes."""
+
+WAIT = 0.5
+"""s to wait for a result before the progress is shown again."""
+
+PATIENCE = 30.0
+"""s that an interrupted work item has to save its state."""
+
+logger = logging.getLogger(__name__)
 
 
-class Progress:
-    """How far a benchmark is.
+@dataclass(frozen=True)
+class WorkResult:
+    """End of the work on an item; the store holds the outputs.
 
-    What a unit costs is what units of its kind have taken, in proportion to what was expected of
-    them; as long as none has ended, what was expected.
+    Attributes:
+        item: that was worked on.
+        problem: one line; empty where the item is done.
+        code: exit code of its process.
+    """
+
+    item: WorkItem
+    problem: str = ""
+    code: int = 0
+
+
+class Executor(Protocol):
+    """Place where work items run."""
+
+    def has_room(self, item: WorkItem) -> bool:
+        """Whether an item can be started now."""
+        ...
+
+    def workers(self, threads: int, gpus: float) -> int:
+        """Return how many items that need so much run at once."""
+        ...
+
+    def start(self, item: WorkItem) -> None:
+        """Start an item whose needs are done."""
+        ...
+
+    def wait(self) -> Iterable[WorkResult]:
+        """Wait for results, for half a second at most."""
+        ...
+
+    def close(self) -> None:
+        """End all running items, which can be continued later."""
+        ...
+
+
+class LocalExecutor:
+    """Runs each item in a process of this machine.
 
     Args:
-        units: all of them.
+        store: holds the folders of the items.
+        workers: number of processes.
+    """
+
+    def __init__(self, store: ArtifactStore, workers: int) -> None:
+        self._store, self._workers = store, workers
+        self._running: list[tuple[WorkItem, subprocess.Popen[bytes]]] = []
+
+    def has_room(self, item: WorkItem) -> bool:
+        """Whether a worker is free."""
+        return len(self._running) < self._workers
+
+    def workers(self, threads: int, gpus: float) -> int:
+        """Return the number of processes."""
+        return self._workers
+
+    def start(self, item: WorkItem) -> None:
+        """Start an item in its folder."""
+        self._running.append((item, start_worker(item.to_json(), self._store.prepare(item))))
+
+    def wait(self) -> Iterable[WorkResult]:
+        """Wait until a process has ended, for half a second at most."""
+        end = time.monotonic() + WAIT
+        while time.monotonic() < end:
+            ended = [pair for pair in self._running if pair[1].poll() is not None]
+            if ended:
+                self._running = [pair for pair in self._running if pair not in ended]
+                return [self._result(item, process) for item, process in ended]
+            time.sleep(POLL)
+        return []
+
+    def close(self) -> None:
+        """Let processes save their state, then end them."""
+        for _, process in self._running:
+            process.terminate()
+        end = time.monotonic() + PATIENCE
+        for _, process in self._running:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(end - time.monotonic(), 0.0))
+            end_worker(process)
+        self._running = []
+
+    def _result(self, item: WorkItem, process: subprocess.Popen[bytes]) -> WorkResult:
+        end_worker(process)
+        if process.returncode == 0 and self._store.is_done(item):
+            return WorkResult(item)
+        log = self._store.folder(item) / LOG
+        last = last_line(log.read_text(encoding="utf-8", errors="replace"))
+        problem = f"{last or f'exit code {process.returncode}'} (all of it: {log})"
+        return WorkResult(item, problem, process.returncode)
+
+
+class ItemsFailedError(RuntimeError):
+    """Some work items failed; the others are done."""
+
+
+def run_items(
+    items: Sequence[WorkItem], store: ArtifactStore, executor: Executor, progress: GridProgress
+) -> None:
+    """Do all work items that are not done yet.
+
+    After a failure, everything that does not need the failed item is still done.
+
+    Args:
+        items: in order of priority.
+        store: of their outputs.
+        executor: that runs them.
+        progress: over these and perhaps further items.
+
+    Raises:
+        RequestError: an item reports a wrong request.
+        ItemsFailedError: items failed, all others are done.
+    """
+    waiting = {item.key: item for item in items if not store.is_done(item)}
+    # For each item, those of its needs that are not done.
+    needs = {
+        key: {need.key for need in item.needs if not store.is_done(need)}
+        for key, item in waiting.items()
+    }
+    for key, item in waiting.items():
+        if not needs[key] <= waiting.keys():
+            raise ValueError(f"{item.folder} needs items that are neither done nor given")
+    done: set[str] = set()
+    failed: list[WorkItem] = []
+    running = 0
+    while True:
+        for item in list(waiting.values()):
+            if needs[item.key] <= done and executor.has_room(item):
+                executor.start(waiting.pop(item.key))
+                progress.start(item)
+                running += 1
+        if not running:  # nothing waits, or only what needs failed items
+            break
+        for result in executor.wait():
+            running -= 1
+            item = result.item
+            manifest = store.manifest(item)
+            progress.end(item, None if manifest is None else float(manifest["seconds"]))
+            if result.code == EXIT_WRONG_REQUEST:
+                raise RequestError(f"{item}: {result.problem}")
+            if result.problem:
+                logger.error("%s failed: %s", item, result.problem)
+                failed.append(item)
+            else:
+                done.add(item.key)
+        progress.show()
+    if failed:
+        raise ItemsFailedError(
+            f"{len(failed)} work items failed, the first of them {failed[0]}; everything that does "
+            "not need them is done, and the same command tries them again"
+        )
+
+
+class GridProgress:
+    """Progress over a grid of work items, in units of time.
+
+    The cost of an item is the mean over the finished items of its kind, in proportion to the
+    expected durations; before one has finished, the expected duration.
+
+    Args:
+        items: all of them.
         workers: how many run at once.
-        later: s of work that comes after the units and is not planned yet.
-        clock: tells seconds.
-        bar: whether to draw.
+        later: s of work that follows and is not planned yet.
+        clock: current time, s.
+        bar: whether to draw a bar.
     """
 
     def __init__(
         self,
-        units: Iterable[Unit],
+        items: Iterable[WorkItem],
         workers: int,
         *,
         later: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
         bar: bool = True,
     ) -> None:
-        self._units = {unit.key: unit for unit in units}
-        self._workers = workers
-        self.later = later
-        self._clock = clock
-        self._took: dict[str, float] = {}
+        self._items = {item.key: item for item in items}
+        self._workers, self._later, self._clock = workers, later, clock
+        self._seconds: dict[str, float] = {}
         self._ended: set[str] = set()
-        self._since: dict[str, float] = {}
-        self._bar = tqdm(total=1.0, bar_format=FORMAT, disable=not bar)
+        self._started: dict[str, float] = {}
+        bar_format = "{percentage:3.0f}% |{bar}| {desc}"
+        self._bar = tqdm(total=1.0, bar_format=bar_format, disable=not bar)
         self._shown = -1
 
-    def add(self, units: Iterable[Unit]) -> None:
-        """Take the units in that were to come later."""
-        self.later = 0.0
-        self._units |= {unit.key: unit for unit in units}
+    def add(self, items: Iterable[WorkItem]) -> None:
+        """Add the items that were to follow later."""
+        self._later = 0.0
+        self._items |= {item.key: item for item in items}
 
-    def started(self, unit: Unit) -> None:
-        """Note that a unit has been started."""
-        self._since[unit.key] = self._clock()
+    def start(self, item: WorkItem) -> None:
+        """Count an item as started."""
+        self._started[item.key] = self._clock()
 
-    def ended(self, unit: Unit, seconds: float | None) -> None:
-        """Note that a unit has ended, and how many seconds it took if it was done."""
-        self._since.pop(unit.key, None)
-        self._ended.add(unit.key)
+    def end(self, item: WorkItem, seconds: float | None) -> None:
+        """Count an item as ended; ``seconds`` is its duration, None if it failed."""
+        self._started.pop(item.key, None)
+        self._ended.add(item.key)
         if seconds is not None:
-            self._took[unit.key] = seconds
+            self._seconds[item.key] = seconds
 
     @property
     def fraction(self) -> float:
         """Share of the work, 0 to 1, that is done."""
-        total = sum(map(self.cost, self._units.values())) + self.later
-        return 1.0 - (sum(self._remaining()) + self.later) / total if total else 1.0
+        total = sum(map(self.cost, self._items.values())) + self._later
+        return 1.0 - (sum(self._remaining()) + self._later) / total if total else 1.0
 
     @property
     def seconds_left(self) -> float:
         """Seconds until everything is done."""
         remaining = self._remaining()
-        return max((sum(remaining) + self.later) / self._workers, *remaining, 0.0)
+        return max((sum(remaining) + self._later) / self._workers, *remaining, 0.0)
 
-    def cost(self, unit: Unit) -> float:
-        """Return how many seconds a unit takes, or has taken."""
-        if unit.key in self._took:
-            return self._took[unit.key]
+    def cost(self, item: WorkItem) -> float:
+        """Return the duration of an item, measured or expected, in s."""
+        if item.key in self._seconds:
+            return self._seconds[item.key]
         ratios = [
-            took / self._units[key].seconds
-            for key, took in self._took.items()
-            if self._units[key].kind == unit.kind
+            seconds / self._items[key].seconds
+            for key, seconds in self._seconds.items()
+            if self._items[key].kind == item.kind
         ]
-        return unit.seconds * (fmean(ratios) if ratios else 1.0)
+        return item.seconds * (fmean(ratios) if ratios else 1.0)
 
     def show(self) -> None:
-        """Draw the bar; where it cannot be drawn over, as in a log, only after a unit has ended."""
+        """Draw the bar; where it cannot be redrawn, as in a log, only after an item has ended."""
         if not self._bar.disable and (self._shown != len(self._ended) or sys.stderr.isatty()):
             self._shown = len(self._ended)
-            count = f"{len(self._ended)} of {len(self._units)} units"
-            count += " before the videos" if self.later else ""
+            count = f"{len(self._ended)} of {len(self._items)} items"
+            count += " before the videos" if self._later else ""
             self._bar.n = self.fraction
-            self._bar.set_description_str(f"{count}, {spelt(self.seconds_left)} left")
+            self._bar.set_description_str(f"{count}, {duration(self.seconds_left)} left")
 
     def close(self) -> None:
-        """Draw it for the last time."""
+        """Draw the bar for the last time."""
         self.show()
         self._bar.close()
 
     def _remaining(self) -> list[float]:
-        """Seconds of each unit that has not ended; one that takes longer is as good as done."""
+        """Return the s of each item that has not ended; 0 for one that has exceeded its cost."""
         now = self._clock()
         return [
-            max(self.cost(unit) - (now - self._since.get(key, now)), 0.0)
-            for key, unit in self._units.items()
+            max(self.cost(item) - (now - self._started.get(key, now)), 0.0)
+            for key, item in self._items.items()
             if key not in self._ended
         ]
-
-
-def spelt(seconds: float) -> str:
-    """Spell a duration: ``45 s``, ``12 min``, ``1 h 05 min``."""
-    if seconds < 90.0:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60.0)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How the work on a unit ended; the store holds what it made.
-
-    Attributes:
-        unit: which one.
-        problem: what went wrong, in one line; empty where it is done.
-        code: exit code of its process.
-    """
-
-    unit: Unit
-    problem: str = ""
-    code: int = 0
-
-
-class Executor(Protocol):
-    """Where units run."""
-
-    def has_room(self, unit: Unit) -> bool:
-        """Say whether a unit may be started now."""
-        ...
-
-    def workers(self, threads: int, gpus: float) -> int:
-        """Return how many units that need so much run at once."""
-        ...
-
-    def start(self, unit: Unit) -> None:
-        """Start a unit whose needs are done."""
-        ...
-
-    def wait(self) -> Iterable[Outcome]:
-        """Wait for a moment, or until units have ended; return these."""
-        ...
-
-    def close(self) -> None:
-        """End what is still running; it can be gone on with later."""
-        ...
-
-
-class UnitsFailedError(RuntimeError):
-    """Some units failed; the others are done."""
-
-
-def run_units(units: Sequence[Unit], store: Store, executor: Executor, progress: Progress) -> None:
-    """Do all units that are not done yet.
-
-    A unit that fails does not keep those from being done that do without it.
-
-    Args:
-        units: none before those that it needs.
-        store: where their files are.
-        executor: where they run.
-        progress: told of every unit that starts or ends.
-
-    Raises:
-        RequestError: a unit says that the request was wrong.
-        UnitsFailedError: units failed, all others are done.
-    """
-    known = {unit.key: unit for top in units for unit in (*top.needs, top)}
-    done = {key for key, unit in known.items() if store.is_done(unit)}
-    waiting = [unit for unit in units if unit.key not in done]
-    running: set[str] = set()
-    failed: list[str] = []
-    while waiting or running:
-        for unit in _ready(waiting, done):
-            if executor.has_room(unit):
-                executor.start(unit)
-                progress.started(unit)
-                running.add(unit.key)
-                waiting.remove(unit)
-        if not running:
-            raise ValueError(f"{waiting[0].folder} needs units that are neither done nor given")
-        for outcome in executor.wait():
-            running.remove(outcome.unit.key)
-            progress.ended(outcome.unit, _seconds(store, outcome))
-            if outcome.code == EXIT_WRONG_REQUEST:
-                raise RequestError(f"{outcome.unit.kind} {outcome.unit.name}: {outcome.problem}")
-            if not outcome.problem:
-                done.add(outcome.unit.key)
-                continue
-            logger.error("%s %s failed: %s", outcome.unit.kind, outcome.unit.name, outcome.problem)
-            failed.append(f"{outcome.unit.kind} {outcome.unit.name}")
-            waiting = _without_dependents(waiting, outcome.unit)
-        progress.show()
-    if failed:
-        raise UnitsFailedError(
-            f"{len(failed)} units failed, the first of them {failed[0]}; everything that does "
-            "without them is done, and the same command tries them again"
-        )
-
-
-def _ready(waiting: Sequence[Unit], done: set[str]) -> list[Unit]:
-    return [unit for unit in waiting if all(need.key in done for need in unit.needs)]
-
-
-def _without_dependents(waiting: Sequence[Unit], failed: Unit) -> list[Unit]:
-    """Leave out what can no longer be done."""
-    lost = {failed.key}
-    kept: list[Unit] = []
-    for unit in waiting:
-        if any(need.key in lost for need in unit.needs):
-            lost.add(unit.key)
-        else:
-            kept.append(unit)
-    return kept
-
-
-def _seconds(store: Store, outcome: Outcome) -> float | None:
-    note = store.note(outcome.unit)
-    return None if note is None else float(note["seconds"])

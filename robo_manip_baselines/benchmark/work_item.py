@@ -1,7 +1,7 @@
-"""A unit of work: a pure function from a specification and files to files.
+"""Work items, pure functions from settings and files to files, and the store of what they make.
 
-A unit runs in a folder of its own. What it needs lies there under fixed names, and what it makes
-lies below ``out/``: so nothing that it writes depends on where the folder is or on who runs it.
+A work item runs in a folder of its own. Its inputs lie there under fixed names, and its outputs lie
+below ``out/``: nothing that it writes depends on where the folder is or on which process runs it.
 """
 
 from __future__ import annotations
@@ -9,186 +9,148 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import platform
 import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache, cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import (
+    atomic_file,
+    file_digest,
+    read_json,
+    write_json,
+    write_text,
+)
+from robo_manip_baselines.runs.versions import software_versions, source_digest
+
+ITEMS = "items"
+"""Folder, in that of a benchmark, of its work items."""
 
 OUT = "out"
-"""Folder, in that of the unit, of what it makes."""
+"""Folder, in that of a work item, of its outputs."""
 
-PACKAGE = Path(__file__).parents[1]
-"""Folder of robo_manip_baselines."""
+LOG = "log.txt"
+MANIFEST = "item.json"
 
 MOUNTS = {"demonstrations": "demonstrations", "training": "run"}
-"""Kind of a unit -> folder in which units that need it find what it made."""
+"""Kind of a work item -> folder in which items that need it find its outputs."""
 
 
-@dataclass(frozen=True)
-class InputFile:
-    """A file that comes from outside.
+@cache
+def item_versions() -> dict[str, str]:
+    """Return the versions of the software that outputs depend on."""
+    return software_versions("h5py", "mujoco", "numpy", "robo_manip_baselines", "torch")
 
-    Attributes:
-        name: under which a unit finds it.
-        path: where it is.
-        sha256: of its bytes.
-    """
 
-    name: str
-    path: Path
-    sha256: str
-
-    @classmethod
-    def of(cls, name: str, path: Path) -> InputFile:
-        """Note what the file holds now.
-
-        Raises:
-            OSError: it cannot be read.
-        """
-        return cls(name, path.resolve(), hashlib.sha256(path.read_bytes()).hexdigest())
+@cache
+def _digest(path: Path) -> str:
+    return file_digest(path)
 
 
 @dataclass(frozen=True, eq=False)
-class Unit:
-    """What is to be done.
+class WorkItem:
+    """Part of a benchmark that one process does.
 
     Attributes:
         kind: ``demonstrations``, ``training``, ``evaluation`` or ``video``.
-        name: tells units of a kind apart.
-        work: ``module:function`` that does it, called with ``settings`` in the unit's folder.
-        settings: everything that decides what comes out, ready for JSON.
-        needs: units whose files it reads.
-        files: files from outside that it reads.
+        name: unique within its kind.
+        function: ``module:name`` of the function that is called with ``settings`` in the item's
+            folder.
+        settings: everything that decides the outputs, ready for JSON.
+        needs: items whose outputs it reads.
+        files: name in the item's folder -> file of the user that it reads.
         threads: CPU threads.
         gpus: share of a GPU, 0 for none.
-        seconds: that it is expected to take.
+        seconds: expected duration.
     """
 
     kind: str
     name: str
-    work: str
+    function: str
     settings: Mapping[str, Any]
-    needs: tuple[Unit, ...] = ()
-    files: tuple[InputFile, ...] = ()
+    needs: tuple[WorkItem, ...] = ()
+    files: Mapping[str, Path] = field(default_factory=dict)
     threads: int = 1
     gpus: float = 0.0
     seconds: float = 1.0
 
+    def __str__(self) -> str:
+        return f"{self.kind} {self.name}"
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """Everything that the outputs depend on, ready for JSON."""
+        return {
+            "kind": self.kind,
+            "name": self.name,  # conditions that are equal but for it are trained separately
+            "function": self.function,
+            "settings": dict(self.settings),
+            "needs": sorted(need.key for need in self.needs),
+            "inputs": {name: _digest(path) for name, path in self.files.items()},
+            "threads": self.threads,
+            "versions": item_versions(),
+        }
+
     @cached_property
     def key(self) -> str:
-        """SHA-256 of everything that what comes out depends on, the versions of software too."""
-        text = json.dumps(
-            {
-                "kind": self.kind,
-                "name": self.name,  # arms that are the same but for it are trained apart
-                "work": self.work,
-                "settings": self.settings,
-                "needs": sorted(unit.key for unit in self.needs),
-                "files": {file.name: file.sha256 for file in self.files},
-                "threads": self.threads,
-                "versions": versions(),
-            },
-            sort_keys=True,
-        )
-        return hashlib.sha256(text.encode()).hexdigest()
+        """SHA-256 of the content."""
+        return hashlib.sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()
 
     @property
     def folder(self) -> str:
         """Relative path of its folder: readable, and another one for other contents."""
         return f"{self.kind}/{self.name}_{self.key[:12]}"
 
-    def document(self) -> dict[str, Any]:
-        """Return what the process that does the work is told."""
-        return {
-            "key": self.key,
-            "kind": self.kind,
-            "name": self.name,
-            "work": self.work,
-            "settings": dict(self.settings),
-            "threads": self.threads,
-            "versions": versions(),
-            "source": source_digest(),
-        }
+    def to_json(self) -> dict[str, Any]:
+        """Return the request to the process that does the work.
+
+        The digest of the package's files is no part of the key: a corrected comment would cost
+        hours of training.
+        """
+        return {"key": self.key, **self.content, "source": source_digest()}
 
 
-def is_of_other_source(note: Mapping[str, Any]) -> bool:
-    """Say whether a unit's document is of a package whose files were others than now."""
-    return note.get("source") != source_digest()
-
-
-@cache
-def source_digest() -> str:
-    """SHA-256 of the package's files: its programs, models, recorded motion, statistics.
-
-    It is no part of the key, or a comment that is mended would cost hours of training.
-    """
-    found = hashlib.sha256()
-    for path in sorted(PACKAGE.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            found.update(f"{path.relative_to(PACKAGE).as_posix()}\0".encode())
-            found.update(hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Return the versions of what results depend on."""
-    packages = ("h5py", "mujoco", "numpy", "robo_manip_baselines", "torch")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
-DONE = "unit.json"
-LOG = "log.txt"
-
-
-class Store:
-    """The units of a benchmark.
+class ArtifactStore:
+    """Folders of work items, by their keys.
 
     Args:
-        root: folder ``units/``; made when something is written.
+        root: made when something is written.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
 
-    def folder(self, unit: Unit) -> Path:
-        """Return the folder of a unit."""
-        return self.root / unit.folder
+    def folder(self, item: WorkItem) -> Path:
+        """Return the folder of an item."""
+        return self.root / item.folder
 
-    def note(self, unit: Unit) -> dict[str, Any] | None:
-        """Return what ``unit.json`` says; None where the unit is not done."""
-        return read_note(self.folder(unit), unit.key)
+    def manifest(self, item: WorkItem) -> dict[str, Any] | None:
+        """Return the manifest of an item; None where it is not done."""
+        return read_manifest(self.folder(item), item.key)
 
-    def is_done(self, unit: Unit) -> bool:
-        """Whether everything that the unit makes is there."""
-        return self.note(unit) is not None
+    def is_done(self, item: WorkItem) -> bool:
+        """Whether all outputs of an item are there."""
+        return self.manifest(item) is not None
 
-    def files(self, unit: Unit) -> dict[str, Path]:
-        """Return what a unit that is done has made: path below ``out/`` -> file."""
-        note = self.note(unit)
-        if note is None:
-            raise FileNotFoundError(f"{unit.folder} is not done")
-        return {name: self.folder(unit) / OUT / name for name in note["files"]}
+    def outputs(self, item: WorkItem) -> dict[str, Path]:
+        """Return the outputs of an item that is done: path below ``out/`` -> file."""
+        manifest = self.manifest(item)
+        if manifest is None:
+            raise FileNotFoundError(f"{item.folder} is not done")
+        return {name: self.folder(item) / OUT / name for name in manifest["files"]}
 
-    def inputs(self, unit: Unit) -> dict[str, Path]:
-        """Return what a unit reads: path in its folder -> file. Its needs must be done."""
-        found = {file.name: file.path for file in unit.files}
-        for need in unit.needs:
-            mount = MOUNTS[need.kind]
-            found |= {f"{mount}/{name}": path for name, path in self.files(need).items()}
-        return found
-
-    def prepare(self, unit: Unit) -> Path:
-        """Make a unit's folder, with links to what it reads; return it."""
-        folder = self.folder(unit)
+    def prepare(self, item: WorkItem) -> Path:
+        """Make and return the folder of an item, with links to its inputs; its needs are done."""
+        folder = self.folder(item)
         folder.mkdir(parents=True, exist_ok=True)
-        for name, path in self.inputs(unit).items():
+        inputs = dict(item.files)
+        for need in item.needs:
+            outputs = self.outputs(need).items()
+            inputs |= {f"{MOUNTS[need.kind]}/{name}": path for name, path in outputs}
+        for name, path in inputs.items():
             link = folder / name
             link.parent.mkdir(parents=True, exist_ok=True)
             temporary = link.with_name(f".{link.name}.{os.getpid()}.partial")
@@ -197,36 +159,33 @@ class Store:
             temporary.replace(link)
         return folder
 
-    def commit(self, unit: Unit, files: Mapping[str, bytes], seconds: float, log: str) -> None:
-        """Write what a unit made elsewhere, then that it is done."""
-        if self.is_done(unit):  # by somebody else in the meantime, who may be reading it
+    def commit(self, item: WorkItem, files: Mapping[str, bytes], seconds: float, log: str) -> None:
+        """Write outputs that were made elsewhere, then the manifest."""
+        if self.is_done(item):  # by another process meanwhile, which may be reading it
             return
-        folder = self.folder(unit)
-        shutil.rmtree(folder, ignore_errors=True)  # whatever was left of an earlier attempt here
+        folder = self.folder(item)
+        shutil.rmtree(folder, ignore_errors=True)  # left by an interrupted attempt
         for name, content in files.items():
             with atomic_file(folder / OUT / name) as temporary:
                 temporary.write_bytes(content)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / LOG).write_text(log, encoding="utf-8")
-        write_note(folder, unit.document(), sorted(files), seconds)
+        write_text(folder / LOG, log)
+        write_manifest(folder, item.to_json(), sorted(files), seconds)
 
 
-def read_note(folder: Path, key: str) -> dict[str, Any] | None:
-    """Return what ``unit.json`` says; None unless it is of this key and its files are there."""
+def read_manifest(folder: Path, key: str) -> dict[str, Any] | None:
+    """Read the manifest of a folder; None unless it is of this key and its files are there."""
     try:
-        note = json.loads((folder / DONE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        manifest = read_json(folder / MANIFEST)
+    except RequestError:
         return None
-    is_whole = (
-        isinstance(note, dict)
-        and note.get("key") == key
-        and all((folder / OUT / name).is_file() for name in note.get("files", [""]))
+    is_whole = manifest.get("key") == key and all(
+        (folder / OUT / name).is_file() for name in manifest.get("files", [""])
     )
-    return note if is_whole else None
+    return manifest if is_whole else None
 
 
-def write_note(folder: Path, document: Mapping[str, Any], files: list[str], seconds: float) -> None:
-    """Write ``unit.json``: the unit is done."""
-    note = {**document, "files": files, "seconds": round(seconds, 3)}
-    with atomic_file(folder / DONE) as temporary:
-        temporary.write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
+def write_manifest(
+    folder: Path, request: Mapping[str, Any], files: Sequence[str], seconds: float
+) -> None:
+    """Write the manifest, last of all files: the item is done."""
+    write_json(folder / MANIFEST, {**request, "files": files, "seconds": round(seconds, 3)})

@@ -1,175 +1,203 @@
-"""The process that does a unit of work: ``python -m robo_manip_baselines.benchmark.worker``.
+"""Process that does one work item, ``python -m robo_manip_baselines.benchmark.worker``.
 
-It runs in the unit's folder, is told what to do on the first line of its standard input, and ends
-when that is closed: whoever started it is gone then, and another may already be about to go on.
+It runs in the item's folder, reads the request on the first line of its standard input, and ends
+when that is closed: the process that started it is gone then, and another may continue the item.
+`start_worker` starts it.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.work_item import (
+    LOG,
     MOUNTS,
     OUT,
-    read_note,
-    source_digest,
-    versions,
-    write_note,
+    item_versions,
+    read_manifest,
+    write_manifest,
 )
 from robo_manip_baselines.data.files import seed_of
-from robo_manip_baselines.policy.registry import load_part
+from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import locked
+from robo_manip_baselines.runs.versions import source_digest
 
 LIBRARY = "motion_library.npz"
-"""of recorded motion, where it is not the one that ships with the package."""
+"""Recorded motion of the user."""
 
 FORECAST = "motion_forecast.npz"
-"""The same with a forecast of `forecasts` in it."""
+"""Recorded motion with a forecast of `forecasts` as its predictions."""
 
 STATS = "error_stats.json"
-"""Error statistics, where they are not those that ship with the package."""
+"""Error statistics of the user."""
 
 SCRATCH = "--scratch"
-"""Argument that says that the folder goes if whoever started this does."""
+"""Argument: remove the folder if the process that started this one ends."""
 
-Work = Callable[[Mapping[str, Any]], int | None]
+Function = Callable[[Mapping[str, Any]], int | None]
 
 
-def main() -> int:
-    """Do the unit that standard input names; leave it alone if it is done already."""
-    # Without a buffer, whose lock a thread that reads must not hold when Python ends.
-    with open(0, "rb", buffering=0, closefd=False) as stdin:
-        line = stdin.readline()
-    is_scratch = SCRATCH in sys.argv
-    if not line:
-        _end(is_scratch)
-    document = json.loads(line)
-    threading.Thread(target=_end_with_stdin, args=(is_scratch,), daemon=True).start()
-    _require_same_software(document)
-    folder = Path.cwd()
-    with _locked(folder):
-        if read_note(folder, document["key"]):
-            return 0
-        begin = time.perf_counter()
-        work: Work = load_part(document["work"])
-        if code := work(document["settings"]):
-            return code
-        _remove_inputs(folder)
-        write_note(folder, document, _made(), time.perf_counter() - begin)
-    return 0
+def start_worker(
+    request: Mapping[str, Any], folder: Path, *, is_scratch: bool = False
+) -> subprocess.Popen[bytes]:
+    """Start the process of a work item; it ends with this one.
+
+    Args:
+        request: see `WorkItem.to_json`.
+        folder: of the item, with its inputs.
+        is_scratch: remove the folder if this process ends before the item.
+    """
+    # In a process of its own: the number of threads is fixed when PyTorch is imported.
+    threads = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    environment = dict.fromkeys(threads, str(request["threads"])) | {"TQDM_DISABLE": "1"}
+    with (folder / LOG).open("ab") as log:
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "robo_manip_baselines.benchmark.worker",
+                *([SCRATCH] if is_scratch else []),
+            ],
+            cwd=folder,
+            env={**os.environ, **environment},
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+    if process.stdin:
+        with suppress(BrokenPipeError):  # it has failed already, with an exit code
+            process.stdin.write(json.dumps(request).encode() + b"\n")
+            process.stdin.flush()
+    return process
+
+
+def end_worker(process: subprocess.Popen[bytes]) -> None:
+    """End the process of a work item, if it has not ended, and free what belongs to it."""
+    if process.stdin:
+        with suppress(BrokenPipeError):
+            process.stdin.close()
+    process.kill()
+    process.wait()
+
+
+def last_line(log: str) -> str:
+    """Return the last line of a log that is not empty."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    return lines[-1].removeprefix("error: ") if lines else ""
 
 
 def demonstrate(settings: Mapping[str, Any]) -> None:
-    """Let the scripted expert record episodes; keep those that show how it is done."""
-    from robo_manip_baselines.commands.rollout import EXAMPLE, RolloutOptions, rollout
-    from robo_manip_baselines.runs.command import parse
+    """Record demonstrations; keep the successful ones."""
+    from robo_manip_baselines.rollout.demonstrate import Collection, collect
 
     _write_forecast(settings)
-    rollout(parse(RolloutOptions, EXAMPLE, args=settings["args"]))
+    collect(Collection.from_json(settings["config"]))
     for path in Path(OUT).iterdir():
         if seed_of(path) is None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def train(settings: Mapping[str, Any]) -> int | None:
-    """Train a policy, or go on with it; keep what acting needs of the last checkpoint."""
+def train(settings: Mapping[str, Any]) -> int:
+    """Train a policy, or continue; of the checkpoints keep the last, without the optimiser."""
     from robo_manip_baselines.training.requirements import prepare_pytorch
 
     prepare_pytorch()
-    from robo_manip_baselines.commands.train import parse_config
     from robo_manip_baselines.policy.checkpoint import TRAINER, TRAINER_TENSORS
     from robo_manip_baselines.runs.checkpoints import list_checkpoints
-    from robo_manip_baselines.training.trainer import train
+    from robo_manip_baselines.training.config import TrainConfig
+    from robo_manip_baselines.training.trainer import train as train_policy
 
-    if code := train(parse_config(settings["args"]), resume=True):
-        return code
-    *earlier, (_, last) = list_checkpoints(Path(OUT))
-    for _, folder in earlier:
-        shutil.rmtree(folder)
-    for name in (TRAINER, TRAINER_TENSORS):
-        (last / name).unlink(missing_ok=True)
-    return None
+    code = train_policy(TrainConfig.from_json(settings["config"]), resume=True)
+    if not code:
+        *earlier, (_, last) = list_checkpoints(Path(OUT))
+        for _, folder in earlier:
+            shutil.rmtree(folder)
+        for name in (TRAINER, TRAINER_TENSORS):
+            (last / name).unlink(missing_ok=True)
+    return code
 
 
 def evaluate(settings: Mapping[str, Any]) -> None:
-    """Let a trained policy act."""
+    """Evaluate a policy."""
     from robo_manip_baselines.training.requirements import prepare_pytorch
 
     prepare_pytorch()
-    from robo_manip_baselines.commands.rollout import EXAMPLE, RolloutOptions, rollout
-    from robo_manip_baselines.runs.command import parse
+    from robo_manip_baselines.rollout.evaluation import EvaluationConfig
+    from robo_manip_baselines.rollout.evaluation import evaluate as evaluate_policy
 
     _write_forecast(settings)
-    rollout(parse(RolloutOptions, EXAMPLE, args=settings["args"]))
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the unit's folder, waiting for whoever does the same unit at this moment."""
-    descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
+    evaluate_policy(EvaluationConfig.from_json(settings["config"]))
 
 
 def _write_forecast(settings: Mapping[str, Any]) -> None:
-    from robo_manip_baselines.benchmark.forecasts import write_library
-
     if settings["prediction"] != "truth":
         source = Path(LIBRARY) if Path(LIBRARY).exists() else None
         write_library(Path(FORECAST), source, settings["prediction"])
 
 
-def _end_with_stdin(is_scratch: bool) -> None:
-    """Wait until standard input is closed, then end this process at once."""
+def main() -> int:
+    """Do the work item that is requested on standard input, unless it is done already."""
+    # Without a buffer, whose lock a thread that reads must not hold when Python ends.
+    with open(0, "rb", buffering=0, closefd=False) as stdin:
+        line = stdin.readline()
+    if not line:
+        _end()
+    request = json.loads(line)
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
+    _require_same_software(request)
+    folder = Path.cwd()
+    with locked(folder, wait=True):
+        if read_manifest(folder, request["key"]):
+            return 0
+        begin = time.perf_counter()
+        function: Function = load_part(request["function"])
+        if code := function(request["settings"]):
+            return code
+        for name in MOUNTS.values():
+            shutil.rmtree(folder / name, ignore_errors=True)
+        for name in (LIBRARY, FORECAST, STATS):
+            (folder / name).unlink(missing_ok=True)
+        made = (p for p in Path(OUT).rglob("*") if p.is_file() and not p.name.startswith("."))
+        files = sorted(path.relative_to(OUT).as_posix() for path in made)
+        write_manifest(folder, request, files, time.perf_counter() - begin)
+    return 0
+
+
+def _end_with_stdin() -> None:
     while os.read(0, 1):
         pass
-    _end(is_scratch)
+    _end()
 
 
-def _end(is_scratch: bool) -> None:
-    if is_scratch:
+def _end() -> None:
+    if SCRATCH in sys.argv:
         shutil.rmtree(Path.cwd(), ignore_errors=True)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _made() -> list[str]:
-    """List what is below ``out/``, hidden files apart."""
-    paths = (path for path in Path(OUT).rglob("*") if path.is_file())
-    return sorted(p.relative_to(OUT).as_posix() for p in paths if not p.name.startswith("."))
-
-
-def _remove_inputs(folder: Path) -> None:
-    """Remove links to, or copies of, what the unit has read."""
-    for name in MOUNTS.values():
-        shutil.rmtree(folder / name, ignore_errors=True)
-    for name in (LIBRARY, FORECAST, STATS):
-        (folder / name).unlink(missing_ok=True)
-
-
-def _require_same_software(document: Mapping[str, Any]) -> None:
-    here = versions()
-    for name, number in document["versions"].items():
-        if here[name] != number:
+def _require_same_software(request: Mapping[str, Any]) -> None:
+    here = item_versions()
+    for name, version in request["versions"].items():
+        if here[name] != version:
             raise RequestError(
-                f"{name} is {here[name]} here and {number} where the benchmark was started; "
+                f"{name} is {here[name]} here and {version} where the benchmark was started; "
                 "install the same versions everywhere"
             )
-    if document["source"] != source_digest():
+    if request["source"] != source_digest():
         raise RequestError(
             "the files of robo_manip_baselines are not those with which the benchmark was started; "
             "install the same everywhere, or, if they were just edited, start it again"

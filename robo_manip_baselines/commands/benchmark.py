@@ -1,4 +1,4 @@
-"""The options of ``bin/Benchmark.py``."""
+"""``bin/Benchmark.py``: its options, what it prints, exit codes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,78 +16,102 @@ from pathlib import Path
 import tyro
 
 from robo_manip_baselines.benchmark.aggregation import (
-    summary,
+    aggregate_results,
+    closing_summary,
     videos_to_make,
-    write_outcome,
-    write_results,
+    write_aggregation,
 )
-from robo_manip_baselines.benchmark.conditions import ARMS, ArmLine, choose_arms, read_arms
-from robo_manip_baselines.benchmark.local import LocalExecutor
-from robo_manip_baselines.benchmark.plan import Plan, make_plan, missing_predictions
-from robo_manip_baselines.benchmark.presets import PRESETS, Preset
+from robo_manip_baselines.benchmark.conditions import CONDITIONS, read_conditions
+from robo_manip_baselines.benchmark.plan import (
+    PRESETS,
+    BenchmarkPreset,
+    Plan,
+    make_plan,
+    missing_predictions,
+)
 from robo_manip_baselines.benchmark.scheduler import (
     Executor,
-    Progress,
-    UnitsFailedError,
-    run_units,
-    spelt,
+    GridProgress,
+    ItemsFailedError,
+    LocalExecutor,
+    run_items,
 )
-from robo_manip_baselines.benchmark.work_item import Store, Unit, is_of_other_source
+from robo_manip_baselines.benchmark.work_item import ITEMS, ArtifactStore, WorkItem
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.runs.command import EXIT_FAILED, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder
+from robo_manip_baselines.runs.progress import closing_table, duration
+from robo_manip_baselines.runs.versions import source_digest
 from robo_manip_baselines.training.requirements import prepare_pytorch
+
+DESCRIPTION = """Train every condition of a benchmark, evaluate all of them on common seeds, and
+write tables and a report. The same command continues where an earlier one was stopped."""
 
 EXAMPLE = "python bin/Benchmark.py feeding --preset smoke"
 
 EXECUTORS = ("local", "ray")
 
+EARLIER_ITEMS = "units"
+"""Folder of the work items of earlier releases."""
+
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """Train every arm of a benchmark, evaluate all of them on common seeds, and write tables and a
-    report. The same command goes on where an earlier one was stopped.
+    """Options of a benchmark.
+
+    Attributes:
+        benchmark: Name of the benchmark: feeding, delay.
+        preset: Size: cpu (without images), paper (three cameras, a GPU) or smoke (three minutes).
+        conditions: Names of conditions, with spaces or commas between them; those of the preset if
+            not given.
+        conditions_file: YAML file of conditions; the one that ships with the package if not given.
+        train_seeds: Trainings of each condition, seeds from 0; as in the preset if not given.
+        num_episodes: Evaluation episodes of each training, seeds from 1000; as in the preset if not
+            given.
+        motion_library: File of recorded face motion; the one that ships with the package if not
+            given.
+        error_stats: File of error statistics; the one that ships with the package if not given.
+        reference: Condition that tables compare the others with; current if not given, or the first
+            one.
+        executor: Place of the work: local (processes of this machine) or ray (a Ray cluster).
+        address: Only with --executor ray: address of the cluster, or auto; if not given, one is
+            started here.
+        num_workers: Only with --executor local: work items that run at once; as many as the cores
+            carry if not given.
+        out: Folder to write to; results/<benchmark>_<preset> if not given.
+        shard: i/n: do only the i-th of n parts, and write no tables; a call without it does that.
+        videos: --no_videos leaves a success and a failure of each condition out of the report.
+        dry_run: Only print what there is to do.
+
+    Raises:
+        RequestError: a value is not valid.
     """
 
     benchmark: tyro.conf.Positional[str]
-    """Which benchmark: feeding, delay."""
     preset: str = "cpu"
-    """How large: cpu (without images), paper (three cameras, a GPU) or smoke (three minutes)."""
-    arms: tuple[str, ...] = ()
-    """Names of arms, with spaces or commas between them; those of the preset if not given."""
-    arms_file: Path | None = None
-    """YAML file of arms; the one that ships with the package if not given."""
+    conditions: tuple[str, ...] = ()
+    conditions_file: Path | None = None
     train_seeds: int | None = None
-    """Trainings of each arm, seeds from 0; as the preset says if not given."""
     num_episodes: int | None = None
-    """Evaluation episodes of each training, seeds from 1000; as the preset says if not given."""
     motion_library: Path | None = None
-    """File of recorded face motion; the one that ships with the package if not given."""
     error_stats: Path | None = None
-    """File of error statistics; the one that ships with the package if not given."""
     reference: str | None = None
-    """Arm that tables compare the others with; current if not given, or the first one."""
     executor: str = "local"
-    """Where the work is done: local (processes of this machine) or ray (a Ray cluster)."""
     address: str | None = None
-    """Only with --executor ray: of the cluster, or auto; if not given, one is started here."""
     num_workers: int | None = None
-    """Only with --executor local: units that run at once; as many as the cores carry if not
-    given."""
     out: Path | None = None
-    """Folder to write to; results/<benchmark>_<preset> if not given."""
     shard: str | None = None
-    """i/n: do only the i-th of n parts, and write no tables; a call without it does that."""
     videos: bool = True
-    """--no_videos leaves a success and a failure of each arm out of the report."""
     dry_run: bool = False
-    """Only say what there is to do."""
 
     def __post_init__(self) -> None:
-        if self.arms_file is None:
-            require_choice("benchmark", self.benchmark, [path.stem for path in ARMS.glob("*.yaml")])
+        if self.conditions_file is None:
+            shipped = [path.stem for path in CONDITIONS.glob("*.yaml")]
+            require_choice("benchmark", self.benchmark, shipped)
         require_choice("preset", self.preset, PRESETS)
         require_choice("executor", self.executor, EXECUTORS)
         if self.num_workers is not None and self.num_workers < 1:
@@ -96,30 +120,19 @@ class BenchmarkOptions:
             raise RequestError("--num_workers goes with --executor local; Ray counts its own cores")
         if self.executor != "ray" and self.address is not None:
             raise RequestError("--address goes with --executor ray; leave it out")
-        self.part  # noqa: B018 — what is no part is refused here
+        self.part  # noqa: B018 — refuses what is no part
         self.size  # noqa: B018
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the arms; empty for all of the file.
-
-        Those of a preset are arms of ``feeding``.
-        """
-        given = tuple(name for part in self.arms for name in part.split(",") if name)
-        is_feeding = self.benchmark == "feeding" and self.arms_file is None
-        return given or (PRESETS[self.preset].arms if is_feeding else ())
-
-    @property
-    def size(self) -> Preset:
-        """The preset with what was given in place of its own."""
+    def size(self) -> BenchmarkPreset:
+        """Preset with the given numbers in place of its own."""
         given = {"train_seeds": self.train_seeds, "num_episodes": self.num_episodes}
-        return replace(
-            PRESETS[self.preset], **{name: v for name, v in given.items() if v is not None}
-        )
+        changes = {name: value for name, value in given.items() if value is not None}
+        return replace(PRESETS[self.preset], **changes)
 
     @property
     def folder(self) -> Path:
-        """The folder to write to."""
+        """Folder to write to."""
         return self.out or Path("results") / f"{self.benchmark}_{self.preset}"
 
     @property
@@ -136,82 +149,113 @@ class BenchmarkOptions:
             raise RequestError(f"shard '{self.shard}': must be i/n with i from 1 to n, such as 2/8")
         return int(match[1]), int(match[2])
 
+    @property
+    def workers(self) -> int:
+        """Number of work items that run at once on this machine."""
+        cores = os.cpu_count() or 1
+        if hasattr(os, "sched_getaffinity"):
+            cores = len(os.sched_getaffinity(0))
+        return self.num_workers or max(cores // self.size.threads, 1)
 
-UNITS = "units"
 
-logger = logging.getLogger(__name__)
+def parse_options(args: Sequence[str]) -> BenchmarkOptions:
+    """Read a command line, with options under their present or earlier names.
+
+    Raises:
+        RequestError: one line that names what is wrong and what is valid.
+        SystemExit: with code 0 after ``--help``.
+    """
+    given = [re.sub(r"^--arms(?=$|=|[-_]file)", "--conditions", arg) for arg in args]
+    if given != list(args):
+        logger.info("--arms and --arms_file are called --conditions and --conditions_file now")
+    return parse(BenchmarkOptions, EXAMPLE, description=DESCRIPTION, args=given)
 
 
 def benchmark(options: BenchmarkOptions) -> int:
-    """Do what the options ask for.
+    """Run a benchmark.
 
     Returns:
-        The exit code: 0, or 1 where units failed.
+        The exit code: 0, or 1 where work items failed.
 
     Raises:
         RequestError: the request cannot be met.
     """
     plan = plan_of(options)
     if options.reference:
-        require_choice("reference arm", options.reference, [arm.name for arm in plan.arms])
-    store = Store(options.folder / UNITS)
-    units = plan.units(options.part)
-    if others := sum(is_of_other_source(note) for note in map(store.note, units) if note):
+        names = [condition.name for condition in plan.conditions]
+        require_choice("reference condition", options.reference, names)
+    if (options.folder / EARLIER_ITEMS).exists():
+        raise RequestError(
+            f"'{options.folder}' holds a benchmark of an earlier release, which this one cannot "
+            "continue; choose another --out"
+        )
+    store = ArtifactStore(options.folder / ITEMS)
+    items = plan.items(options.part)
+    manifests = [manifest for manifest in map(store.manifest, items) if manifest]
+    if others := sum(manifest.get("source") != source_digest() for manifest in manifests):
         logger.warning(
-            "%d of %d units were done by other code of the package, and are used as they are; "
+            "%d of %d work items were done by other code of the package, and are used as they are; "
             "remove '%s' to do them again",
-            *(others, len(units), store.root),
+            *(others, len(items), store.root),
         )
     if options.dry_run:
-        print(overview(plan, units, store, _workers(options, plan)))  # noqa: T201
+        print(overview(plan, items, store, options.workers))  # noqa: T201
         return 0
     if options.executor == "local":
         _require_device(options.preset, plan)
     prepare_folder(options.folder)
     try:
-        with closing(_executor(options, plan, store)) as executor:
-            carry_out(plan, units, store, executor, options)
-    except UnitsFailedError as error:
+        with closing(_executor(options, store)) as executor:
+            carry_out(plan, items, store, executor, options)
+    except ItemsFailedError as error:
         logger.error("%s", error)
         return EXIT_FAILED
     return 0
 
 
 def plan_of(options: BenchmarkOptions) -> Plan:
-    """Plan what the options ask for.
+    """Plan the benchmark that the options ask for.
+
+    Conditions that nobody has named and that lack their files are left out, with a warning.
 
     Raises:
         RequestError: it cannot be done.
     """
-    env, arms = read_arms(options.arms_file or ARMS / f"{options.benchmark}.yaml")
-    if options.names:
-        arms = choose_arms(arms, options.names)
-    elif not options.arms_file:
-        arms = tuple(arm for arm in arms if not _is_left_out(arm, options))
+    path = options.conditions_file or CONDITIONS / f"{options.benchmark}.yaml"
+    file = read_conditions(path)
+    for preset in file.presets:
+        require_choice(f"preset in '{path}'", preset, PRESETS)
+    given = tuple(name for part in options.conditions for name in part.split(",") if name)
+    conditions = file.conditions
+    if names := given or file.presets.get(options.preset):
+        conditions = file.choose(names)
+    elif not options.conditions_file:
+        library = MotionLibrary.load(options.motion_library)
+        problems = {c.name: missing_predictions(c, library) for c in conditions}
+        for problem in filter(None, problems.values()):
+            logger.warning("left out: %s", problem)
+        conditions = tuple(c for c in conditions if not problems[c.name])
     return make_plan(
-        env, arms, options.size, library=options.motion_library, error_stats=options.error_stats
+        file.env,
+        conditions,
+        options.size,
+        library=options.motion_library,
+        error_stats=options.error_stats,
     )
-
-
-def _is_left_out(arm: ArmLine, options: BenchmarkOptions) -> bool:
-    """Whether nobody has asked for an arm by name and it cannot be had; says so."""
-    if problem := missing_predictions(arm, MotionLibrary.load(options.motion_library)):
-        logger.warning("left out: %s", problem)
-    return bool(problem)
 
 
 def carry_out(
     plan: Plan,
-    units: Sequence[Unit],
-    store: Store,
+    items: Sequence[WorkItem],
+    store: ArtifactStore,
     executor: Executor,
     options: BenchmarkOptions,
 ) -> None:
-    """Do the units, then the videos, then write what it all came to.
+    """Do the work items, then the videos, then write the aggregation.
 
     Raises:
-        RequestError: a unit says that the request was wrong.
-        UnitsFailedError: units failed.
+        RequestError: a work item reports a wrong request.
+        ItemsFailedError: work items failed.
     """
     is_whole = options.part is None
     has_videos = is_whole and options.videos and plan.preset.has_videos
@@ -219,57 +263,54 @@ def carry_out(
         logger.warning("no videos: %s", problem)
         has_videos = False
     workers = executor.workers(plan.preset.threads, plan.preset.gpu_share)
-    later = 2 * len(plan.arms) * plan.video_seconds if has_videos else 0.0
-    with closing(Progress(units, workers, later=later)) as progress:
-        _note_done(progress, units, store)
-        run_units(units, store, executor, progress)
+    later = 2 * len(plan.conditions) * plan.preset.seconds.get("video", 30.0) if has_videos else 0.0
+    with closing(GridProgress(items, workers, later=later)) as progress:
+        _count_done(progress, items, store)
+        run_items(items, store, executor, progress)
         if not is_whole:
             return
-        study = write_results(plan, store, options.folder, options.reference)
-        videos = videos_to_make(plan, study) if has_videos else {}
+        statistics = aggregate_results(plan, store, options.folder, options.reference)
+        videos = videos_to_make(plan, statistics) if has_videos else {}
         progress.add(videos)
-        _note_done(progress, tuple(videos), store)
-        run_units(tuple(videos), store, executor, progress)
-    logger.info("writing tables, plots and the report to %s", options.folder)
-    write_outcome(plan, store, study, options.folder, videos, command_line(sys.argv))
-    print(summary(study, options.folder))  # noqa: T201
+        _count_done(progress, videos, store)
+        run_items(tuple(videos), store, executor, progress)
+    logger.info("writing tables, figures and the report to %s", options.folder)
+    command = shlex.join(["python", f"bin/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+    write_aggregation(plan, store, statistics, options.folder, videos, command)
+    print(closing_summary(statistics, options.folder))  # noqa: T201
 
 
-def overview(plan: Plan, units: Sequence[Unit], store: Store, workers: int) -> str:
-    """Say what there is to do."""
-    todo = [unit for unit in units if not store.is_done(unit)]
-    total, left = Counter(unit.kind for unit in units), Counter(unit.kind for unit in todo)
-    progress = Progress(units, workers, bar=False)
-    _note_done(progress, units, store)
-    spent = sum(float(note["seconds"]) for note in map(store.note, units) if note)
+def overview(plan: Plan, items: Sequence[WorkItem], store: ArtifactStore, workers: int) -> str:
+    """Lay out what there is to do."""
+    total = Counter(item.kind for item in items)
+    left = Counter(item.kind for item in items if not store.is_done(item))
+    progress = GridProgress(items, workers, bar=False)
+    seconds = _count_done(progress, items, store)
     rows = {
-        "arms": ", ".join(arm.name for arm in plan.arms),
-        **{kind: f"{left[kind]} of {count} units to do" for kind, count in total.items()},
-        "done": f"{spelt(spent)} of work, videos apart",
+        "conditions": ", ".join(condition.name for condition in plan.conditions),
+        **{kind: f"{left[kind]} of {count} items to do" for kind, count in total.items()},
+        "done": f"{duration(seconds)} of work, videos apart",
         "workers": str(workers),
-        "time": f"about {spelt(progress.seconds_left)}, videos apart",
+        "time": f"about {duration(progress.seconds_left)}, videos apart",
     }
-    width = max(map(len, rows))
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+    return closing_table(rows)
 
 
-def command_line(argv: Sequence[str]) -> str:
-    """Return the command as it can be typed again."""
-    return shlex.join(["python", f"bin/{Path(argv[0]).name}", *argv[1:]])
-
-
-def _note_done(progress: Progress, units: Sequence[Unit], store: Store) -> None:
-    for unit in units:
-        if note := store.note(unit):
-            progress.ended(unit, float(note["seconds"]))
+def _count_done(progress: GridProgress, items: Iterable[WorkItem], store: ArtifactStore) -> float:
+    """Count the items that are done as ended; return the s that they took."""
+    total = 0.0
+    for item in items:
+        if manifest := store.manifest(item):
+            progress.end(item, float(manifest["seconds"]))
+            total += float(manifest["seconds"])
+    return total
 
 
 def _require_device(preset: str, plan: Plan) -> None:
-    """Refuse what no training could be done with, before an hour of demonstrations."""
+    """Refuse a preset whose trainings cannot run here, before an hour of demonstrations."""
     if plan.preset.device == "cpu":
         return
-    # Imported here: it takes seconds.
-    import torch
+    import torch  # slow to import
 
     if not torch.cuda.is_available():
         raise RequestError(
@@ -278,24 +319,15 @@ def _require_device(preset: str, plan: Plan) -> None:
         )
 
 
-def _executor(options: BenchmarkOptions, plan: Plan, store: Store) -> Executor:
+def _executor(options: BenchmarkOptions, store: ArtifactStore) -> Executor:
     if options.executor == "local":
-        return LocalExecutor(store, _workers(options, plan))
-    # Imported here: Ray is needed by nobody else.
-    from robo_manip_baselines.benchmark.ray_cluster import RayExecutor
+        return LocalExecutor(store, options.workers)
+    from robo_manip_baselines.benchmark.ray_cluster import RayExecutor  # an optional dependency
 
     return RayExecutor(store, options.address)
-
-
-def _workers(options: BenchmarkOptions, plan: Plan) -> int:
-    """How many units run at once."""
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    return options.num_workers or max(cores // plan.preset.threads, 1)
 
 
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Benchmark.py``."""
     prepare_pytorch()
-    return benchmark(parse(BenchmarkOptions, EXAMPLE, args=args))
+    return benchmark(parse_options(args))

@@ -1,4 +1,4 @@
-"""The subcommands of ``bin/Dataset.py``: each is its options and a function to text."""
+"""``bin/Dataset.py``: inspect and verify a folder of episodes."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean, stdev
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 
-from robo_manip_baselines.data.episode import read_metadata
-from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes
-from robo_manip_baselines.data.verify import damage_summary, verify_dataset
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.progress import closing_table
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,9 @@ class Verify:
     """Decode every image, too; --no_images checks the rest only, which is much faster."""
 
     def run(self) -> tuple[str, int]:
-        """The text to print and the exit code."""
+        """Return the text to print and the exit code."""
+        from robo_manip_baselines.data.verify import damage_summary, verify_dataset
+
         problems = verify_dataset(self.folder, images=self.images)
         lines = [*map(str, problems), damage_summary(self.folder, problems)]
         return "\n".join(lines), int(any(not problem.is_warning for problem in problems))
@@ -36,16 +36,14 @@ class Verify:
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a folder of episodes holds."""
+    """List what a folder of episodes holds."""
 
     folder: Annotated[Path, tyro.conf.arg(metavar="DIR"), tyro.conf.Positional]
     """Folder of episode_*.hdf5 files, as Rollout.py writes it."""
 
     def run(self) -> tuple[str, int]:
-        """The text to print and the exit code."""
-        rows = dataset_info(self.folder)
-        width = max(map(len, rows))
-        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items()), 0
+        """Return the text to print and the exit code."""
+        return closing_table(dataset_info(self.folder)), 0
 
 
 Command = (
@@ -55,12 +53,15 @@ Command = (
 
 
 def dataset_info(folder: Path) -> dict[str, str]:
-    """What a folder of episodes holds, as rows of a table: name -> text.
+    """Return the contents of a folder of episodes as rows of a table: name -> text.
 
     Raises:
-        RequestError: if there is no such folder or no episode in it.
-        EpisodeFileError: if a file is damaged.
+        RequestError: there is no such folder, no episode in it, or a file is damaged.
     """
+    # Imported here: --help needs no HDF5.
+    from robo_manip_baselines.data import list_episodes, read_metadata
+    from robo_manip_baselines.data.files import FAILED_FOLDER
+
     paths = list_episodes(folder)
     failed_folder = folder / FAILED_FOLDER
     failed = list_episodes(failed_folder) if failed_folder.is_dir() else []
@@ -106,9 +107,9 @@ def _counted(values: Any) -> str:
 
 
 def _spread(values: list[float]) -> str:
-    """Mean, sample standard deviation and range."""
-    deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
-    return f"{np.mean(values):.2f} ± {deviation:.2f} ({min(values):.2f} … {max(values):.2f})"
+    """Format mean, sample standard deviation and range."""
+    deviation = stdev(values) if len(values) > 1 else 0.0
+    return f"{mean(values):.2f} ± {deviation:.2f} ({min(values):.2f} … {max(values):.2f})"
 
 
 def main(args: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""``bin/Replay.py``: its options, and what it does and says."""
+"""``bin/Replay.py``: replay recorded episodes, compare every state, and draw a video."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ from pathlib import Path
 
 import tyro
 
-from robo_manip_baselines.data import list_episodes
-from robo_manip_baselines.rollout.replay import deviation
-from robo_manip_baselines.rollout.videos import write_preview
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -19,7 +16,7 @@ EXAMPLE = "python bin/Replay.py dataset/FeedingEnv/episode_000000.hdf5 --video r
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Act recorded episodes out again, compare every state, and draw a video if asked."""
+    """Replay recorded episodes, compare every state, and draw a video if asked."""
 
     episodes: tyro.conf.Positional[tuple[Path, ...]]
     """Episode files, or folders of them."""
@@ -27,12 +24,17 @@ class ReplayOptions:
     """Write an H.264 video of the replayed episodes here."""
 
 
-def replay_command(options: ReplayOptions) -> int:
-    """Replay what the options name; return 1 if any state strays from the recorded one.
+def replay_episodes(options: ReplayOptions) -> int:
+    """Replay the episodes of the options; return 1 if any state strays from the recorded one.
 
     Raises:
         RequestError: no episode is named, or a file is damaged or of another model.
     """
+    # Imported here: --help needs no simulator.
+    from robo_manip_baselines.data import list_episodes
+    from robo_manip_baselines.rollout.replay import deviation
+    from robo_manip_baselines.rollout.videos import write_preview
+
     paths = [
         path
         for given in options.episodes
@@ -56,4 +58,4 @@ def replay_command(options: ReplayOptions) -> int:
 
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Replay.py``."""
-    return replay_command(parse(ReplayOptions, EXAMPLE, args=args))
+    return replay_episodes(parse(ReplayOptions, EXAMPLE, args=args))

@@ -95,8 +95,9 @@ class EvaluationConfig:
             ("num_envs", self.num_envs, 1),
             ("workers", self.workers, 0),
             ("video", self.videos, 0),
+            ("n_action_steps", self.n_action_steps, 1),
         ):
-            if value < least:
+            if value is not None and value < least:
                 raise RequestError(f"{name} {value}: must be {least} or more")
         if self.temporal_ensemble and self.n_action_steps is not None:
             raise RequestError("--temporal_ensemble and --n_action_steps: give one of them")

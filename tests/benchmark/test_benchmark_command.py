@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -13,21 +14,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robo_manip_baselines.benchmark.conditions import ARMS
+from robo_manip_baselines.benchmark.conditions import CONDITIONS
 from robo_manip_baselines.benchmark.forecasts import write_library
-from robo_manip_baselines.benchmark.work_item import Store, source_digest
+from robo_manip_baselines.benchmark.work_item import ArtifactStore
 from robo_manip_baselines.commands import benchmark as command
-from robo_manip_baselines.commands.benchmark import EXAMPLE, BenchmarkOptions, benchmark, plan_of
+from robo_manip_baselines.commands.benchmark import (
+    EXAMPLE,
+    BenchmarkOptions,
+    benchmark,
+    parse_options,
+    plan_of,
+)
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY, PREDICTION
-from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.versions import source_digest
 
-from .conftest import ARMS as STUB_ARMS
-from .conftest import PRESET, outcome
+from .conftest import CONDITIONS as STUB_CONDITIONS
+from .conftest import PRESET, contents
 
 
 def options(line: str) -> BenchmarkOptions:
-    return parse(BenchmarkOptions, EXAMPLE, args=line.split())
+    return parse_options(line.split())
 
 
 @pytest.mark.parametrize(
@@ -56,11 +63,11 @@ def test_a_wrong_option_is_refused_in_one_line(line: str, words: str) -> None:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("feeding --arms current,curent_pred_h2", "did you mean 'current_pred_h2'"),
+        ("feeding --conditions current,curent_pred_h2", "did you mean 'current_pred_h2'"),
         ("feeding --preset smoke --motion_library none.npz", "none.npz"),
         ("feeding --preset smoke --error_stats none.json", "none.json"),
         ("feeding --preset smoke --reference curent", "did you mean 'current'"),
-        ("feeding --arms_file none.yaml", "none.yaml"),
+        ("feeding --conditions_file none.yaml", "none.yaml"),
     ],
 )
 def test_a_wrong_plan_is_refused_before_anything_is_written(
@@ -84,38 +91,38 @@ def test_a_preset_for_a_gpu_is_refused_where_there_is_none(
     assert not (tmp_path / "out").exists()
 
 
-def test_arms_are_chosen_by_name_and_from_a_file(tmp_path: Path) -> None:
+def test_conditions_are_chosen_by_name_and_from_a_file(tmp_path: Path) -> None:
     def names(line: str) -> list[str]:
-        return [arm.name for arm in plan_of(options(line)).arms]
+        return [c.name for c in plan_of(options(line)).conditions]
 
     assert names("feeding --preset smoke") == [
         "current",
         "current_pred_h2",
         "current_pred_h2_uniform",
     ]
-    assert names("feeding --arms baseline current") == ["baseline", "current"]
+    assert names("feeding --conditions baseline current") == ["baseline", "current"]
     assert names("delay --preset smoke") == names("delay --preset paper") == names("delay")
-    assert names("feeding --arms current,baseline") == ["baseline", "current"]
+    assert names("feeding --conditions current,baseline") == ["baseline", "current"]
     mine = tmp_path / "mine.yaml"
-    mine.write_text("arms: [{name: a}, {name: b, delay: 3}]")
-    assert names(f"mine --preset smoke --arms_file {mine}") == ["a", "b"]
-    assert names(f"mine --preset smoke --arms_file {mine} --arms b") == ["b"]
+    mine.write_text("conditions: [{name: a}, {name: b, delay: 3}]")
+    assert names(f"mine --preset smoke --conditions_file {mine}") == ["a", "b"]
+    assert names(f"mine --preset smoke --conditions_file {mine} --conditions b") == ["b"]
 
 
-def test_an_arm_that_cannot_be_had_is_left_out_unless_it_is_named(
+def test_a_condition_that_cannot_be_had_is_left_out_unless_it_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     bare = tmp_path / "bare.npz"
     with np.load(DEFAULT_LIBRARY) as archive:
         np.savez(bare, **{k: archive[k] for k in archive.files if k != PREDICTION})
     plan = plan_of(options(f"feeding --motion_library {bare}"))
-    assert len(plan.arms) == 15
-    assert "left out: arm 'current_pred_h2_model'" in caplog.text
+    assert len(plan.conditions) == 15
+    assert "left out: condition 'current_pred_h2_model'" in caplog.text
     with pytest.raises(RequestError, match="no predicted mouth"):
-        plan_of(options(f"feeding --arms current_pred_h2_model --motion_library {bare}"))
+        plan_of(options(f"feeding --conditions current_pred_h2_model --motion_library {bare}"))
     full = tmp_path / "full.npz"
     write_library(full, None, "persistence")
-    assert len(plan_of(options(f"feeding --motion_library {full}")).arms) == 16
+    assert len(plan_of(options(f"feeding --motion_library {full}")).conditions) == 16
 
 
 def test_a_dry_run_counts_and_writes_nothing(
@@ -125,26 +132,26 @@ def test_a_dry_run_counts_and_writes_nothing(
     line = f"feeding --preset smoke --train_seeds 2 --num_episodes 6 --out {out} --dry_run"
     assert benchmark(options(line)) == 0
     said = capsys.readouterr().out
-    assert re.search(r"demonstrations +2 of 2 units", said)
-    assert re.search(r"training +6 of 6 units", said)
-    assert re.search(r"evaluation +12 of 12 units", said)  # 4 and 2 episodes
+    assert re.search(r"demonstrations +2 of 2 items", said)
+    assert re.search(r"training +6 of 6 items", said)
+    assert re.search(r"evaluation +12 of 12 items", said)  # 4 and 2 episodes
     assert not out.exists()
 
 
 @pytest.fixture
 def stub_command(stub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkOptions:
-    """A command whose preset and arms are the stub's."""
+    """A command whose preset and conditions are the stub's."""
     from robo_manip_baselines.commands import benchmark as options_module
 
-    arms = tmp_path / "stub.yaml"
-    arms.write_text(
-        "arms:\n- {name: current, obs: current}\n"
+    conditions = tmp_path / "stub.yaml"
+    conditions.write_text(
+        "conditions:\n- {name: current, obs: current}\n"
         "- {name: late, delay: 3, title: 'Prediction, late'}\n"
         "- {name: ahead, expert: anticipatory}\n"
     )
     monkeypatch.setitem(options_module.PRESETS, "smoke", PRESET)
     monkeypatch.setattr(command.sys, "argv", ["bin/Benchmark.py", "stub", "it's"])
-    return options(f"stub --preset smoke --arms_file {arms} --out {tmp_path / 'out'}")
+    return options(f"stub --preset smoke --conditions_file {conditions} --out {tmp_path / 'out'}")
 
 
 @pytest.mark.long
@@ -157,32 +164,34 @@ def test_shards_and_then_a_call_without_come_to_the_same(
     out = tmp_path / "out"
     for part in ("1/2", "2/2"):
         assert benchmark(replace(stub_command, shard=part)) == 0
-        assert set(outcome(out)) == set()
+        assert set(contents(out)) == set()
     plan = plan_of(stub_command)
-    store = Store(out / "units")
-    assert all(store.is_done(unit) for unit in plan.units())
-    written = {unit.key: store.note(unit) for unit in plan.units()}
+    store = ArtifactStore(out / "items")
+    assert all(store.is_done(item) for item in plan.items())
+    written = {item.key: store.manifest(item) for item in plan.items()}
     (out / "tables").mkdir()
     (out / "tables" / "old.md").write_text("of an earlier benchmark")
     assert benchmark(stub_command) == 0
-    assert written == {unit.key: store.note(unit) for unit in plan.units()}  # nothing done twice
+    assert written == {
+        item.key: store.manifest(item) for item in plan.items()
+    }  # nothing done twice
     told = capsys.readouterr().out
     assert "Prediction, late" in told
     assert str(out / "report.html") in told
-    found = outcome(out)
-    assert found.pop("commands.txt").decode().splitlines()[0] == (
+    found = contents(out)
+    assert json.loads(found.pop("configs.json"))["command"] == (
         "python bin/Benchmark.py stub 'it'\"'\"'s'"
     )
     assert b"bin/Benchmark.py stub" in found.pop("report.html")
     assert found == {name: reference[name] for name in found}
     assert len(found) == len(reference) - 2
-    assert [arm.name for arm in plan.arms] == [arm.name for arm in STUB_ARMS]
+    assert [c.name for c in plan.conditions] == [c.name for c in STUB_CONDITIONS]
 
 
 @pytest.fixture
 def done(stub_command: BenchmarkOptions, reference_folder: Path) -> Path:
-    """The folder of the command, with all units done."""
-    shutil.copytree(reference_folder / "units", stub_command.folder / "units")
+    """The folder of the command, with all items done."""
+    shutil.copytree(reference_folder / "items", stub_command.folder / "items")
     return stub_command.folder
 
 
@@ -204,48 +213,79 @@ def test_the_reference_is_chosen_without_doing_anything_again(
 def test_a_dry_run_adds_up_what_is_done(
     stub_command: BenchmarkOptions, done: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for note in (done / "units" / "training").glob("*/unit.json"):
+    for note in (done / "items" / "training").glob("*/item.json"):
         note.write_text(re.sub(r'"seconds": [\d.]+', '"seconds": 3600.0', note.read_text()))
     assert benchmark(replace(stub_command, dry_run=True)) == 0
     said = capsys.readouterr().out
-    assert re.search(r"training +0 of 3 units", said)
+    assert re.search(r"training +0 of 3 items", said)
     assert re.search(r"done +3 h 0\d min of work", said)
 
 
 @pytest.mark.long
-def test_units_of_other_code_are_used_and_said_to_be(
+def test_items_of_other_code_are_used_and_said_to_be(
     stub_command: BenchmarkOptions, done: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    note = next((done / "units" / "training").glob("*/unit.json"))
+    note = next((done / "items" / "training").glob("*/item.json"))
     note.write_text(note.read_text().replace(source_digest(), "ab" * 32))
     assert benchmark(stub_command) == 0
-    assert "1 of 13 units were done by other code of the package" in caplog.text
-    assert str(done / "units") in caplog.text
+    assert "1 of 13 work items were done by other code of the package" in caplog.text
+    assert str(done / "items") in caplog.text
 
 
 @pytest.mark.long
-def test_the_exit_code_says_that_units_failed(
+def test_the_exit_code_says_that_items_failed(
     stub_command: BenchmarkOptions, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("STUB_FAIL", "--delay")
+    monkeypatch.setenv("STUB_FAIL", "delay")
     assert benchmark(stub_command) == 1
-    assert outcome(tmp_path / "out") == {}
+    assert contents(tmp_path / "out") == {}
     monkeypatch.delenv("STUB_FAIL")
     assert benchmark(stub_command) == 0
-    assert "report.html" in outcome(tmp_path / "out")
+    assert "report.html" in contents(tmp_path / "out")
 
 
-def test_help_names_the_options_and_an_example(repository: Path) -> None:
-    said = subprocess.run(
-        [sys.executable, str(repository / "bin" / "Benchmark.py"), "--help"],
+def page_of_help() -> str:
+    script = Path(__file__).parents[2] / "bin" / "Benchmark.py"
+    return subprocess.run(
+        [sys.executable, str(script), "--help"],
         capture_output=True,
         text=True,
         env={**os.environ, "MUJOCO_GL": "disabled"},
         check=True,
     ).stdout
-    for name in ("--preset", "--arms_file", "--shard", "--executor", "--dry_run", EXAMPLE):
-        assert name in said
 
 
-def test_the_arms_ship_with_the_package() -> None:
-    assert {path.name for path in ARMS.glob("*.yaml")} == {"feeding.yaml", "delay.yaml"}
+def test_help_names_the_options_and_an_example() -> None:
+    page = page_of_help()
+    for name in ("--preset", "--conditions_file", "--shard", "--executor", "--dry_run", EXAMPLE):
+        assert name in page
+
+
+def test_the_conditions_ship_with_the_package() -> None:
+    assert {path.name for path in CONDITIONS.glob("*.yaml")} == {"feeding.yaml", "delay.yaml"}
+
+
+def test_options_of_an_earlier_release_are_read_with_a_note(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    assert options("feeding --arms baseline current").conditions == ("baseline", "current")
+    assert caplog.text.count("are called --conditions") == 1
+    mine = tmp_path / "mine.yaml"
+    for line in (f"x --arms_file {mine}", f"x --arms-file={mine} --arms=a"):
+        assert options(line).conditions_file == mine
+    assert "--arms" not in page_of_help()
+
+
+def test_a_folder_of_an_earlier_release_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "units").mkdir()
+    with pytest.raises(RequestError, match=r"earlier release.*another --out"):
+        benchmark(options(f"feeding --preset smoke --out {tmp_path}"))
+    assert [path.name for path in tmp_path.iterdir()] == ["units"]
+
+
+def test_a_preset_that_does_not_exist_is_refused_in_a_file(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("presets: {smok: [a]}\nconditions: [{name: a}]")
+    with pytest.raises(RequestError, match=r"mine\.yaml.*did you mean 'smoke'"):
+        plan_of(options(f"mine --conditions_file {mine}"))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from robo_manip_baselines.benchmark.scheduler import Progress, spelt
-from robo_manip_baselines.benchmark.work_item import Unit
+from robo_manip_baselines.benchmark.scheduler import GridProgress
+from robo_manip_baselines.benchmark.work_item import WorkItem
+from robo_manip_baselines.runs.progress import duration
 
 
 class Clock:
@@ -15,22 +16,22 @@ class Clock:
         return self.now
 
 
-def unit(kind: str, name: str, seconds: float) -> Unit:
-    return Unit(kind, name, "m:f", {}, seconds=seconds)
+def item(kind: str, name: str, seconds: float) -> WorkItem:
+    return WorkItem(kind, name, "m:f", {}, seconds=seconds)
 
 
 def test_time_left_follows_what_units_of_a_kind_have_taken() -> None:
     clock = Clock()
-    trainings = [unit("training", str(n), 100.0) for n in range(4)]
-    evaluations = [unit("evaluation", str(n), 10.0) for n in range(4)]
-    progress = Progress([*trainings, *evaluations], 2, clock=clock, bar=False)
+    trainings = [item("training", str(n), 100.0) for n in range(4)]
+    evaluations = [item("evaluation", str(n), 10.0) for n in range(4)]
+    progress = GridProgress([*trainings, *evaluations], 2, clock=clock, bar=False)
     assert (progress.fraction, progress.seconds_left) == (0.0, 220.0)
-    progress.started(trainings[0])
-    progress.started(trainings[1])
+    progress.start(trainings[0])
+    progress.start(trainings[1])
     clock.now += 50.0
     assert progress.seconds_left == pytest.approx((440.0 - 100.0) / 2)
     assert progress.fraction == pytest.approx(100.0 / 440.0)
-    progress.ended(trainings[0], 50.0)  # twice as fast as expected: the others will be, too
+    progress.end(trainings[0], 50.0)  # twice as fast as expected: the others will be, too
     assert progress.cost(trainings[2]) == 50.0
     assert progress.cost(evaluations[0]) == 10.0
     # Two trainings to come, and the one that has run for 50 s is as good as done.
@@ -39,20 +40,20 @@ def test_time_left_follows_what_units_of_a_kind_have_taken() -> None:
 
 
 def test_one_long_unit_is_waited_for_by_many_workers() -> None:
-    progress = Progress([unit("training", "a", 100.0)], 8, clock=Clock(), bar=False)
+    progress = GridProgress([item("training", "a", 100.0)], 8, clock=Clock(), bar=False)
     assert progress.seconds_left == 100.0
 
 
 def test_what_is_planned_later_counts_from_the_start() -> None:
-    progress = Progress([unit("training", "a", 60.0)], 2, later=40.0, clock=Clock(), bar=False)
-    done = unit("training", "a", 60.0)
-    progress.ended(done, 60.0)
+    progress = GridProgress([item("training", "a", 60.0)], 2, later=40.0, clock=Clock(), bar=False)
+    done = item("training", "a", 60.0)
+    progress.end(done, 60.0)
     assert progress.fraction == pytest.approx(0.6)
-    videos = [unit("video", str(n), 10.0) for n in range(2)]
+    videos = [item("video", str(n), 10.0) for n in range(2)]
     progress.add(videos)
     assert progress.seconds_left == 10.0
     for video in videos:
-        progress.ended(video, None)  # failed: it is over all the same
+        progress.end(video, None)  # failed: it is over all the same
     assert (progress.fraction, progress.seconds_left) == (1.0, 0.0)
 
 
@@ -60,5 +61,5 @@ def test_what_is_planned_later_counts_from_the_start() -> None:
     ("seconds", "words"),
     [(0.4, "0 s"), (89.4, "89 s"), (90.0, "2 min"), (5369.0, "89 min"), (5400.0, "1 h 30 min")],
 )
-def test_durations_are_spelt(seconds: float, words: str) -> None:
-    assert spelt(seconds) == words
+def test_durations_have_a_readable_unit(seconds: float, words: str) -> None:
+    assert duration(seconds) == words

@@ -1,4 +1,4 @@
-"""Units on a real Ray cluster of two nodes on this machine, one of which is lost on the way."""
+"""Items on a real Ray cluster of two nodes on this machine, one of which is lost on the way."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from robo_manip_baselines.benchmark.aggregation import write_outcome, write_results
+from robo_manip_baselines.benchmark.aggregation import aggregate_results, write_aggregation
 from robo_manip_baselines.benchmark.plan import Plan
 from robo_manip_baselines.benchmark.ray_cluster import RayExecutor
-from robo_manip_baselines.benchmark.scheduler import Outcome, Progress, run_units
-from robo_manip_baselines.benchmark.work_item import Store
+from robo_manip_baselines.benchmark.scheduler import GridProgress, WorkResult, run_items
+from robo_manip_baselines.benchmark.work_item import ArtifactStore
 from robo_manip_baselines.runs.errors import RequestError
 
-from .conftest import outcome
+from .conftest import contents
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install '.[ray]'")
 
@@ -53,13 +53,13 @@ def cluster(stub: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 class Watched(RayExecutor):
     """Loses a node when every CPU of the cluster is in the middle of a training."""
 
-    def __init__(self, store: Store, address: str, cluster: Any, node: Any) -> None:
+    def __init__(self, store: ArtifactStore, address: str, cluster: Any, node: Any) -> None:
         super().__init__(store, address)
         self.cluster, self.node, self.lost = cluster, node, False
 
-    def wait(self) -> list[Outcome]:
+    def wait(self) -> list[WorkResult]:
         ended = list(super().wait())
-        kinds = {unit.kind for unit in self._running.values()}
+        kinds = {item.kind for item in self._running.values()}
         if not self.lost and kinds == {"training"} and not ray.available_resources().get("CPU"):
             self.cluster.remove_node(self.node, allow_graceful=False)
             self.lost = True
@@ -71,22 +71,22 @@ def test_a_node_lost_in_the_middle_changes_nothing(
 ) -> None:
     node = cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
     cluster.wait_for_nodes()
-    store, units = Store(tmp_path / "units"), stub_plan.units()
+    store, items = ArtifactStore(tmp_path / "items"), stub_plan.items()
     with closing(Watched(store, cluster.address, cluster, node)) as executor:
-        run_units(units, store, executor, Progress(units, 2, bar=False))
+        run_items(items, store, executor, GridProgress(items, 2, bar=False))
         assert executor.lost
-    study = write_results(stub_plan, store, tmp_path)
-    write_outcome(stub_plan, store, study, tmp_path, {}, "the command")
-    assert outcome(tmp_path) == reference
-    assert all(store.is_done(unit) for unit in units)
+    statistics = aggregate_results(stub_plan, store, tmp_path)
+    write_aggregation(stub_plan, store, statistics, tmp_path, {}, "the command")
+    assert contents(tmp_path) == reference
+    assert all(store.is_done(item) for item in items)
 
 
 def test_a_unit_that_no_node_can_run_is_refused(
     stub_plan: Plan, cluster: Any, tmp_path: Path
 ) -> None:
-    large = replace(stub_plan.units()[0], gpus=1.0)
+    large = replace(stub_plan.items()[0], gpus=1.0)
     with (
-        closing(RayExecutor(Store(tmp_path), cluster.address)) as executor,
+        closing(RayExecutor(ArtifactStore(tmp_path), cluster.address)) as executor,
         pytest.raises(RequestError, match="wants 1 CPUs and 1 GPUs"),
     ):
         executor.has_room(large)
@@ -94,4 +94,4 @@ def test_a_unit_that_no_node_can_run_is_refused(
 
 def test_no_cluster_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="ray start --head"):
-        RayExecutor(Store(tmp_path), "127.0.0.1:1")
+        RayExecutor(ArtifactStore(tmp_path), "127.0.0.1:1")

@@ -1,4 +1,4 @@
-"""Phases of scripted experts: each commands the gripper until it is done.
+"""Phases of scripted experts, and the expert that runs them one after another.
 
 A phase is started with the last command, gives a command every control step, and reports when it
 is done. It knows the world only through an `ExpertView`, so that a new task can string the same
@@ -8,7 +8,7 @@ phases together.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import mink
@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_OPEN, HOME_QPOS
+from robo_manip_baselines.envs.mujoco.expert.kinematics import ArmKinematics
 from robo_manip_baselines.observation import FRAME_PERIOD
 
 RIGHT_BASE = np.array(ARM_BASES["right"][0])
@@ -59,28 +61,28 @@ class ExpertView:
     """State that an expert acts on: the present, and the recorded future.
 
     Attributes:
-        object_position: (3,) m, world.
-        mouth_track: (K, 3) m, world: the mouth now and 1 ... 5 frames of 1/30 s ahead.
-        time_since_lift: s; None before.
-        is_at_mouth: Algorithm 1's spatial condition holds now.
+        target_track: (K, 3) m, world: the target now and 1 ... 5 frames of 1/30 s ahead.
+        object_position: (3,) m, world: the object that the gripper takes, if there is one.
+        elapsed: s since the approach to the target may begin; None before.
+        is_at_target: the task's condition for the end of the approach holds now.
     """
 
-    object_position: NDArray[np.float64]
-    mouth_track: NDArray[np.float64]
-    time_since_lift: float | None
-    is_at_mouth: bool
+    target_track: NDArray[np.float64]
+    object_position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    elapsed: float | None = None
+    is_at_target: bool = False
 
-    def mouth(self, lead: float = 0.0) -> NDArray[np.float64]:
-        """Return the mouth ``lead`` s ahead, interpolated; (3,) m. At most 5 frames ahead."""
-        ahead = np.arange(len(self.mouth_track)) * FRAME_PERIOD
-        return np.array([np.interp(lead, ahead, axis) for axis in self.mouth_track.T])
+    def target(self, lead: float = 0.0) -> NDArray[np.float64]:
+        """Return the target ``lead`` s ahead, interpolated; (3,) m. At most 5 frames ahead."""
+        ahead = np.arange(len(self.target_track)) * FRAME_PERIOD
+        return np.array([np.interp(lead, ahead, axis) for axis in self.target_track.T])
 
 
 class ExpertPhase(Protocol):
     """A stretch of an expert's work."""
 
     def start(self, view: ExpertView, last: Command) -> None:
-        """Begin, ``last`` being the last command."""
+        """Begin, the gripper having been told to be at ``last``."""
         ...
 
     def step(self, view: ExpertView) -> Command:
@@ -96,7 +98,7 @@ class Reach:
     """Go to a pose on a straight line, with the speed profile of least jerk.
 
     Args:
-        target: the pose to go to, given what there is to see when the phase starts.
+        target: gives the pose to go to when the phase starts.
         speed: m/s, the mean along the line.
         least_duration: s, however short the line is.
     """
@@ -158,16 +160,16 @@ class Grip:
 
 
 class Approach:
-    """Move, level, towards the mouth so as to be there when the time is up.
+    """Move, level, towards the target so as to be there when the time is up.
 
     That is lines 9 to 15 of the paper's Algorithm 1.
 
-    The velocity is (mouth - gripper) / (limit - t), with t since the lift and the gripper where it
-    was last commanded.
+    The velocity is (target - gripper) / (limit - t), with t the elapsed time and the gripper where
+    it was last commanded.
 
     Args:
-        limit: s since the lift.
-        lead: s; aim where the mouth will be this much later.
+        limit: s.
+        lead: s; aim where the target will be this much later.
     """
 
     def __init__(self, *, limit: float = 6.0, lead: float = 0.0) -> None:
@@ -179,28 +181,28 @@ class Approach:
 
     def step(self, view: ExpertView) -> Command:
         """Move by velocity times control period."""
-        # Below one control period, the step would go past the mouth.
-        elapsed = view.time_since_lift or 0.0
+        # Below one control period, the step would go past the target.
+        elapsed = view.elapsed or 0.0
         left = max(self._limit - elapsed, CONTROL_PERIOD)
-        velocity = (view.mouth(self._lead) - self._command.position) / left
+        velocity = (view.target(self._lead) - self._command.position) / left
         position = self._command.position + velocity * CONTROL_PERIOD
         self._command = replace(self._command, position=position, orientation=level_at(position))
         return self._command
 
     def is_done(self, view: ExpertView) -> bool:
-        """Done at the mouth, when the time is up, or at once if nothing was lifted."""
-        elapsed = view.time_since_lift
-        return view.is_at_mouth or elapsed is None or elapsed > self._limit
+        """Done at the target, when the time is up, or at once if it may not begin."""
+        elapsed = view.elapsed
+        return view.is_at_target or elapsed is None or elapsed > self._limit
 
 
 class Follow:
-    """Keep a place relative to the mouth, level, getting there gently.
+    """Keep a place relative to the target, level, getting there gently.
 
     Args:
-        offset: (3,) m, world, from the mouth.
+        offset: (3,) m, world, from the target.
         duration: s.
         finger: m; None to keep the fingers as they are.
-        lead: s; follow where the mouth will be this much later.
+        lead: s; follow where the target will be this much later.
         speed: m/s, the largest at which the gap is closed.
     """
 
@@ -220,15 +222,15 @@ class Follow:
         """Note how far from the wanted place it starts."""
         finger = last.finger if self._finger is None else self._finger
         self._last, self._step = replace(last, finger=finger), 0
-        self._gap = last.position - view.mouth(self._lead) - self._offset
+        self._gap = last.position - view.target(self._lead) - self._offset
 
     def step(self, view: ExpertView) -> Command:
-        """Move with the mouth and close the gap to the wanted place."""
+        """Move with the target and close the gap to the wanted place."""
         self._step += 1
         distance = float(np.linalg.norm(self._gap))
         reach = self._speed * CONTROL_PERIOD
         self._gap = self._gap * (0.0 if distance <= reach else 1.0 - reach / distance)
-        position = view.mouth(self._lead) + self._offset + self._gap
+        position = view.target(self._lead) + self._offset + self._gap
         self._last = replace(self._last, position=position, orientation=level_at(position))
         return self._last
 
@@ -244,3 +246,43 @@ def least_jerk(share: float) -> float:
     """
     s = min(max(share, 0.0), 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+class PhasedExpert:
+    """Scripted expert that runs phases with the right arm, by inverse kinematics.
+
+    The expert of a task derives from it and implements ``view`` and ``phases``.
+    """
+
+    def __init__(self) -> None:
+        self._kinematics = ArmKinematics("right")
+
+    def view(self) -> ExpertView:
+        """Return the present state."""
+        raise NotImplementedError
+
+    def phases(self, home: Command) -> list[ExpertPhase]:
+        """Return the phases of one episode, in order, given the pose that it starts from."""
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        """Begin with the first phase; call it after the environment's reset."""
+        self._joints = np.array(HOME_QPOS)
+        home = self._kinematics.forward(self._joints)
+        self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
+        self._phases = self.phases(self._command)
+        self._phase = self._phases.pop(0)
+        self._phase.start(self.view(), self._command)
+
+    def act(self) -> NDArray[np.float32]:
+        """Return the next action, (7,): joint targets in rad and the finger in m."""
+        view = self.view()
+        while self._phases and self._phase.is_done(view):
+            self._phase = self._phases.pop(0)
+            self._phase.start(view, self._command)
+        self._command = self._phase.step(view)
+        target = mink.SE3.from_rotation_and_translation(
+            self._command.orientation, self._command.position
+        )
+        self._joints = self._kinematics.inverse(target, self._joints)
+        return np.append(self._joints, self._command.finger).astype(np.float32)

@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
-from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, MOUTH_BASE, build_cell
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
-from robo_manip_baselines.envs.mujoco.face import FaceModel, add_face
+from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
+from robo_manip_baselines.envs.mujoco.face.model import rotate
 from robo_manip_baselines.envs.mujoco.face.motion import (
     SEGMENT_DURATION,
     MotionLibrary,
     MotionSegment,
 )
-from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FaceReplay
+from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FRAMES_AHEAD, FaceReplay
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry
 from robo_manip_baselines.observation import (
     ARM_JOINTS,
@@ -57,9 +58,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     """Cell with two arms and a head that moves as a recorded person moved.
 
     A task derives from it and implements the methods of the section "task": its objects, their
-    start, and after each step the reward, the end and ``info``. The ``info`` of every task holds
-    ``is_success`` and ``is_success_strict`` (bool), ``completion_time`` (s, None before success)
-    and ``phase`` (one of ``phase_names``).
+    start, and after each step the reward, the end and ``info``; ``docs/add-an-environment.md``
+    makes one. The ``info`` of every task holds ``is_success`` and ``is_success_strict`` (bool),
+    ``completion_time`` (s, None before success) and ``phase`` (one of ``phase_names``).
 
     Args:
         obs, horizon, cameras, image_size, object_pose, arms: see `ObservationSpec`.
@@ -125,8 +126,14 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
         self._pipeline = spec.make_pipeline()
         self.library = MotionLibrary.load(motion_library)
-        if spec.corruption.error == "model" and self.library.predicted is None:
-            raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
+        if spec.corruption.error == "model":
+            if not self.task.predicted_field:
+                raise RequestError(
+                    f"error model: predictors forecast the mouth, not the {self.task.names.target} "
+                    f"of {self.task.name}; choose another error"
+                )
+            if self.library.predicted is None:
+                raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
         self.clips = (
             None
             if clips is None
@@ -182,7 +189,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
     def predicted_target(self) -> Floats | None:
         """(K - 1, 3) m, world: a predictor's output for the target; None without predictions."""
-        return self.predicted_mouth
+        return self.predicted_mouth if self.task.predicted_field else None
 
     # -- indices --------------------------------------------------------------------------------
 
@@ -354,6 +361,34 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         predicted = self.replay.predicted
         index = self.replay.control_index(self._motion_step())
         return None if predicted is None else predicted[index].copy()
+
+    def landmark_track(self, landmark: int) -> Floats:
+        """Return the true position of a point of the face now and 1 ... 5 frames ahead.
+
+        Args:
+            landmark: vertex of `FaceModel`, 0 to 467, numbered as MediaPipe does.
+
+        Returns:
+            (K, 3) m, world.
+        """
+        start = self.replay.control_index(self._motion_step()) * CONTROL_PERIOD
+        displacement, orientation, jaw = self.segment.at(start + FRAMES_AHEAD)
+        mouth, jaw = MOUTH_BASE + self.face_offset + displacement, jaw + REST_OPENING
+        head, turn = self.face.body_poses(mouth, orientation, jaw)["face/head"]
+        point = self.face.deform(self.face.jaw_angle(jaw), [landmark])[:, 0]
+        return head + rotate(turn, point)
+
+    def max_face_force(self) -> float:
+        """Return the largest normal force between the robot and the face now, N.
+
+        For `watch_contacts`: a control step has several physics steps.
+        """
+        force, wrench = 0.0, np.zeros(6)
+        is_face = self.model.geom_contype[self.data.contact.geom] == FACE
+        for contact in np.flatnonzero(is_face.any(axis=1)):
+            mujoco.mj_contactForce(self.model, self.data, contact, wrench)
+            force = max(force, float(wrench[0]))
+        return force
 
     @property
     def jaw_opening(self) -> float:

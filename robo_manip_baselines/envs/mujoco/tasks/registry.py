@@ -216,7 +216,8 @@ class TaskEntry:
         failures: kind of failure -> description.
         names: of target and objects in observations.
         target_field, predicted_field: fields of an episode that hold the true target and a
-            predictor's output.
+            predictor's output for it; ``predicted_field`` is empty where the target is not the
+            mouth, which is what predictors forecast.
         object_fields: fields that hold the poses of the objects, in the order of ``names.objects``.
         fields: that the task adds to an episode file.
         attributes: likewise.

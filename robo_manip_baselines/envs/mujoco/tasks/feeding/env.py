@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.scene import CUBE_SIZE, FACE, add_cube
+from robo_manip_baselines.envs.mujoco.cell.scene import CUBE_SIZE, add_cube
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
@@ -150,7 +150,6 @@ class FeedingEnv(FaceEnv):
         self._is_finger = np.stack(
             [_geoms_of(model, f"right/{side}_finger_link") for side in ("left", "right")]
         )
-        self._is_face = model.geom_contype == FACE
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Add the red cube."""
@@ -228,13 +227,10 @@ class FeedingEnv(FaceEnv):
         pairs = self.data.contact.geom
         on_cube = (pairs == self._cube_geom).any(axis=1)
         self._fingers_on_cube |= self._is_finger[:, pairs[on_cube]].any(axis=(1, 2))
-        for contact in np.flatnonzero(self._is_face[pairs].any(axis=1)):
-            mujoco.mj_contactForce(self.model, self.data, contact, self._wrench)
-            self._face_force = max(self._face_force, float(self._wrench[0]))
+        self._face_force = max(self._face_force, self.max_face_force())
 
     def _clear_contacts(self) -> None:
         self._fingers_on_cube = np.zeros(2, dtype=bool)
-        self._wrench = np.zeros(6)
         self._face_force = 0.0
 
     def _measure(self) -> StepMeasurements:

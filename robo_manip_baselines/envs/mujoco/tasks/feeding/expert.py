@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import mink
 import numpy as np
-from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
-from robo_manip_baselines.envs.mujoco.expert.kinematics import ArmKinematics
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN
 from robo_manip_baselines.envs.mujoco.expert.phases import (
     DOWN,
     Approach,
@@ -18,6 +15,7 @@ from robo_manip_baselines.envs.mujoco.expert.phases import (
     ExpertView,
     Follow,
     Grip,
+    PhasedExpert,
     Reach,
     level_at,
 )
@@ -62,7 +60,7 @@ def anticipatory(env: FeedingEnv) -> FeedingExpert:
     return FeedingExpert(env, lead=ANTICIPATION)
 
 
-class FeedingExpert:
+class FeedingExpert(PhasedExpert):
     """Scripted expert of feeding.
 
     Args:
@@ -71,75 +69,52 @@ class FeedingExpert:
     """
 
     def __init__(self, env: FeedingEnv, lead: float = 0.0) -> None:
+        super().__init__()
         self._env, self._lead = env, lead
-        self._kinematics = ArmKinematics("right")
 
-    def reset(self) -> None:
-        """Begin with the first phase; call it after the environment's reset."""
-        self._joints = np.array(HOME_QPOS)
-        home = self._kinematics.forward(self._joints)
-        self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
-        self._phases = _phases(self._lead, self._command)
-        self._phase = self._phases.pop(0)
-        self._phase.start(self._view(), self._command)
-
-    def act(self) -> NDArray[np.float32]:
-        """Return the next action, (7,): joint targets in rad and the finger in m."""
-        view = self._view()
-        while self._phases and self._phase.is_done(view):
-            self._phase = self._phases.pop(0)
-            self._phase.start(view, self._command)
-        self._command = self._phase.step(view)
-        target = mink.SE3.from_rotation_and_translation(
-            self._command.orientation, self._command.position
-        )
-        self._joints = self._kinematics.inverse(target, self._joints)
-        return np.append(self._joints, self._command.finger).astype(np.float32)
-
-    def _view(self) -> ExpertView:
-        env = self._env
-        mouth = env.mouth_track
+    def view(self) -> ExpertView:
+        """Return the present state."""
+        env, mouth = self._env, self._env.mouth_track
         return ExpertView(
+            target_track=mouth,
             object_position=env.cube_position,
-            mouth_track=mouth,
-            time_since_lift=env.progress.time_since_lift(env.time),
-            is_at_mouth=is_at_mouth(env.gripper_position, mouth[0]),
+            elapsed=env.progress.time_since_lift(env.time),
+            is_at_target=is_at_mouth(env.gripper_position, mouth[0]),
         )
 
+    def phases(self, home: Command) -> list[ExpertPhase]:
+        """Return the phases of one episode, in order."""
 
-def _phases(lead: float, home: Command) -> list[ExpertPhase]:
-    """List the phases of one episode, in order."""
+        def above(view: ExpertView, last: Command) -> Command:
+            height = np.array([0.0, 0.0, GRASP_OFFSET + CLEARANCE])
+            return Command(view.object_position + height, DOWN, FINGER_OPEN)
 
-    def above(view: ExpertView, last: Command) -> Command:
-        height = np.array([0.0, 0.0, GRASP_OFFSET + CLEARANCE])
-        return Command(view.object_position + height, DOWN, FINGER_OPEN)
+        def grasp(view: ExpertView, last: Command) -> Command:
+            height = np.array([0.0, 0.0, GRASP_OFFSET])
+            return Command(view.object_position + height, DOWN, FINGER_OPEN)
 
-    def grasp(view: ExpertView, last: Command) -> Command:
-        height = np.array([0.0, 0.0, GRASP_OFFSET])
-        return Command(view.object_position + height, DOWN, FINGER_OPEN)
+        def lifted(view: ExpertView, last: Command) -> Command:
+            return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
 
-    def lifted(view: ExpertView, last: Command) -> Command:
-        return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
+        def standoff(view: ExpertView, last: Command) -> Command:
+            position = view.target() + STANDOFF
+            return Command(position, level_at(position), last.finger)
 
-    def standoff(view: ExpertView, last: Command) -> Command:
-        position = view.mouth() + STANDOFF
-        return Command(position, level_at(position), last.finger)
+        def go_home(view: ExpertView, last: Command) -> Command:
+            return home
 
-    def go_home(view: ExpertView, last: Command) -> Command:
-        return home
-
-    return [
-        # Phase 1: approach and grasp the cube.
-        Reach(above),
-        Reach(grasp, speed=0.15),
-        Grip(FINGER_CLOSED, 0.4),
-        Reach(lifted, speed=0.2),
-        Reach(standoff, least_duration=1.2),
-        # Phase 2: move towards the mouth.
-        Approach(lead=lead),
-        # Phase 3: insert the cube into the mouth, let go, retract.
-        Follow(INSERTION, 0.4, lead=lead),
-        Follow(INSERTION, 0.3, finger=FINGER_OPEN, lead=lead),
-        Follow(WITHDRAWAL, 0.6, lead=lead, speed=0.3),
-        Reach(go_home),
-    ]
+        return [
+            # Phase 1: approach and grasp the cube.
+            Reach(above),
+            Reach(grasp, speed=0.15),
+            Grip(FINGER_CLOSED, 0.4),
+            Reach(lifted, speed=0.2),
+            Reach(standoff, least_duration=1.2),
+            # Phase 2: move towards the mouth.
+            Approach(lead=self._lead),
+            # Phase 3: insert the cube into the mouth, let go, retract.
+            Follow(INSERTION, 0.4, lead=self._lead),
+            Follow(INSERTION, 0.3, finger=FINGER_OPEN, lead=self._lead),
+            Follow(WITHDRAWAL, 0.6, lead=self._lead, speed=0.3),
+            Reach(go_home),
+        ]

@@ -1,4 +1,4 @@
-"""Which episodes get a video, and what is drawn in."""
+"""Videos of policies: the choice of episodes, and what is drawn in."""
 
 from __future__ import annotations
 
@@ -10,18 +10,16 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
-from robo_manip_baselines.observation.state import to_vector
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
 from robo_manip_baselines.rollout.videos import (
     CYAN,
     _dots,
     pick_for_video,
-    told_mouths,
     video_name,
     write_video,
 )
-from robo_manip_baselines.rollout.workers import Task
+from robo_manip_baselines.rollout.workers import EnvConfig
 
 MISS = EpisodeResult(
     env="FeedingEnv",
@@ -29,13 +27,8 @@ MISS = EpisodeResult(
     is_success=False,
     is_success_strict=False,
     completion_time=None,
-    time_since_lift=None,
     steps=4,
     failure="never_grasped",
-    closest_distance=None,
-    closest_offset=None,
-    cube_offset=None,
-    face_force=0.0,
     motion_clip="clip",
     motion_subject="person",
     policy="Mlp",
@@ -71,15 +64,17 @@ def test_names_say_seed_and_outcome() -> None:
 
 
 @pytest.mark.parametrize("obs", ["baseline", "current", "current_pred"])
-def test_what_the_policy_was_told_is_where_the_mouth_is(task: Task, obs: str) -> None:
-    """Without an error model, the told positions are the true ones, now and ahead."""
-    told = replace(task, spec=replace(task.spec, obs=obs))
-    with told.make() as env:
-        observation, _ = env.reset(seed=3)
-        truth = world_of(env).mouth_track[: told.spec.frames]
-    mouths = told_mouths(told.spec, to_vector(told.spec, observation))
-    assert mouths.shape == (told.spec.frames, 3)
-    np.testing.assert_allclose(mouths, truth, atol=1e-6)  # float32
+def test_without_a_corruption_the_observed_target_is_the_true_one(
+    env_config: EnvConfig, obs: str
+) -> None:
+    config = replace(env_config, spec=replace(env_config.spec, obs=obs))
+    with config.make() as env:
+        env.reset(seed=3)
+        world = world_of(env)
+        truth = world.target_track()[: config.spec.frames]
+    observed = config.spec.target_positions(world.vector)
+    assert observed.shape == (config.spec.frames, 3)
+    np.testing.assert_allclose(observed, truth, atol=1e-6)  # float32
 
 
 def test_dots_are_where_the_points_are_and_points_out_of_view_do_no_harm() -> None:
@@ -93,16 +88,16 @@ def test_dots_are_where_the_points_are_and_points_out_of_view_do_no_harm() -> No
 
 @pytest.mark.gl
 @pytest.mark.long
-def test_a_video_is_the_episode_acted_out_again(task: Task, tmp_path: Path) -> None:
+def test_a_video_is_the_replayed_episode(env_config: EnvConfig, tmp_path: Path) -> None:
     recording = Recording()
-    with task.make() as env:
-        observation, _ = env.reset(seed=0)
+    with env_config.make() as env:
+        env.reset(seed=0)
         for _ in range(4):
-            recording.vectors.append(to_vector(task.spec, observation))
+            recording.vectors.append(world_of(env).vector)
             recording.actions.append(np.zeros(7, np.float32))
-            observation, *_ = env.step(recording.actions[-1])
+            env.step(recording.actions[-1])
     path = tmp_path / "video.mp4"
-    write_video(path, task, MISS, recording)
+    write_video(path, env_config, MISS, recording)
     with av.open(str(path)) as video:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert len(frames) == 3 + 25  # steps 0, 2 and the last, which stays for a second
@@ -111,5 +106,5 @@ def test_a_video_is_the_episode_acted_out_again(task: Task, tmp_path: Path) -> N
     views = [cyan[:, 480 * i : 480 * (i + 1)].sum() for i in range(4)]
     assert views[3] > views[2] > 0  # the enlarged mouth shows larger dots
     with pytest.raises(RuntimeError, match="seed 0 ends otherwise than recorded"):
-        write_video(tmp_path / "no.mp4", task, replace(MISS, is_success=True), recording)
+        write_video(tmp_path / "no.mp4", env_config, replace(MISS, is_success=True), recording)
     assert not (tmp_path / "no.mp4").exists()

@@ -7,9 +7,12 @@ import itertools
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding.failure import FAILURES, failure_kind
-from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import EpisodeWatch
-from robo_manip_baselines.rollout.results import Offset
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
+from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import (
+    FeedingMetrics,
+    Offset,
+    failure_kind,
+)
 
 BELOW = float(np.nextafter(0.06, 0.0))  # m, just at the face
 
@@ -57,7 +60,7 @@ def test_every_combination_of_facts_has_a_known_kind_and_every_kind_occurs() -> 
         for released in (False, True)
         for offset in offsets
     }
-    assert kinds == set(FAILURES)
+    assert kinds == set(ENTRY.failures)
 
 
 def info(phase: str, gripper: tuple[float, float, float], **changes: object) -> dict[str, object]:
@@ -76,17 +79,17 @@ def info(phase: str, gripper: tuple[float, float, float], **changes: object) -> 
     }
 
 
-def watched(*infos: dict[str, object]) -> EpisodeWatch:
-    watch = EpisodeWatch("FeedingEnv", 7, "clip", "person")
+def metrics_of(*infos: dict[str, object]) -> FeedingMetrics:
+    metrics = FeedingMetrics()
     for one in infos:
-        watch.see(one)
-    return watch
+        metrics.update(one)
+    return metrics
 
 
 def test_the_closest_approach_counts_only_while_the_cube_is_carried() -> None:
     at_mouth = (0.0, 0.5, 0.35)
     last = info("release", at_mouth, face_force=2.0, time_since_lift=0.1 + 0.2)
-    watch = watched(
+    metrics = metrics_of(
         info("reach", at_mouth),
         info("grasp", at_mouth, face_force=3.5),
         info("carry", (0.10, 0.5, 0.35)),
@@ -94,32 +97,34 @@ def test_the_closest_approach_counts_only_while_the_cube_is_carried() -> None:
         info("release", at_mouth),
         last,
     )
-    result = watch.result(last)
-    assert (result.steps, result.face_force) == (6, 3.5)
-    assert result.time_since_lift == 0.3  # without what floating point adds
-    assert result.closest_distance == pytest.approx(np.hypot(0.02, 0.02))
-    assert result.closest_offset == pytest.approx((0.02, 0.0, -0.02))
-    assert result.cube_offset == pytest.approx((0.008, 0.0, -0.02))
-    assert result.failure == "missed_low"
+    failure, columns = metrics.result(last)
+    assert columns["face_force"] == 3.5
+    assert columns["time_since_lift"] == 0.3  # without what floating point adds
+    assert columns["closest_distance"] == pytest.approx(np.hypot(0.02, 0.02))
+    assert columns["closest_offset"] == pytest.approx((0.02, 0.0, -0.02))
+    assert columns["cube_offset"] == pytest.approx((0.008, 0.0, -0.02))
+    assert failure == "missed_low"
 
 
 def test_nearest_is_meant_in_units_of_the_tolerances() -> None:
     """2.9 cm out is nearer than 2 cm low: it is within the tolerance, the other is twice it."""
-    watch = watched(info("carry", (0.029, 0.5, 0.35)), info("carry", (0.0, 0.5, 0.33)))
-    result = watch.result(info("carry", (0.0, 0.5, 0.33)))
-    assert result.closest_offset == pytest.approx((0.029, 0.0, 0.0))
-    assert result.cube_offset == pytest.approx((0.017, 0.0, 0.0))
-    assert result.closest_distance == pytest.approx(0.02)
+    metrics = metrics_of(info("carry", (0.029, 0.5, 0.35)), info("carry", (0.0, 0.5, 0.33)))
+    _, columns = metrics.result(info("carry", (0.0, 0.5, 0.33)))
+    assert columns["closest_offset"] == pytest.approx((0.029, 0.0, 0.0))
+    assert columns["cube_offset"] == pytest.approx((0.017, 0.0, 0.0))
+    assert columns["closest_distance"] == pytest.approx(0.02)
 
 
 def test_without_a_lift_there_is_no_closest_approach() -> None:
-    result = watched(info("grasp", (0.0, 0.5, 0.35))).result(info("reach", (0.0, 0.5, 0.35)))
-    assert (result.closest_distance, result.closest_offset) == (None, None)
-    assert result.cube_offset is None
-    assert result.failure == "never_grasped"
+    failure, columns = metrics_of(info("grasp", (0.0, 0.5, 0.35))).result(
+        info("reach", (0.0, 0.5, 0.35))
+    )
+    assert (columns["closest_distance"], columns["closest_offset"]) == (None, None)
+    assert columns["cube_offset"] is None
+    assert failure == "never_grasped"
 
 
 def test_a_success_has_no_kind_of_failure() -> None:
     last = info("deliver", (0.0, 0.5, 0.35), is_success=True, completion_time=4.3)
-    result = watched(last).result(last)
-    assert (result.is_success, result.failure, result.completion_time) == (True, "", 4.3)
+    failure, _ = metrics_of(last).result(last)
+    assert failure == ""

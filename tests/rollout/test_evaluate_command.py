@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,15 +15,19 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.commands.evaluate import evaluate
-from robo_manip_baselines.commands.rollout import EXAMPLE, PolicyOptions, RolloutOptions
+from robo_manip_baselines.commands.rollout import main, parse_options, to_evaluation
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import Checkpoint
 from robo_manip_baselines.policy.presets import Acting
-from robo_manip_baselines.rollout.evaluation import arm_name, choose_acting, plan, run_name
+from robo_manip_baselines.rollout.evaluation import (
+    EvaluationConfig,
+    EvaluationPlan,
+    choose_execution,
+    evaluate,
+    run_name,
+)
 from robo_manip_baselines.rollout.results import read_results
-from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
@@ -41,44 +46,48 @@ def run_folder(make_checkpoint: MakeCheckpoint, tmp_path_factory: pytest.TempPat
     return run
 
 
-def options(run: Path, text: str = "", **changes: object) -> RolloutOptions:
+def command_line(run: Path, text: str = "", out: Path | None = None) -> list[str]:
     words = f"FeedingEnv --policy Mlp --checkpoint {run} --workers 0 --num_episodes 3 {text}"
-    return replace(parse(RolloutOptions, EXAMPLE, args=words.split()), **changes)
+    return [*words.split(), *([] if out is None else ["--out", str(out)])]
+
+
+def config(run: Path, text: str = "", out: Path | None = None) -> EvaluationConfig:
+    return to_evaluation(*parse_options(command_line(run, text, out)))
 
 
 def test_evaluates_and_carries_on(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     once, pieces = tmp_path / "once", tmp_path / "pieces"
-    evaluate(options(run_folder, out=once))
+    main(command_line(run_folder, out=once))
     table = capsys.readouterr().out
-    assert "success             0/3  0.0% (95 % interval 0.0% to 56.1%)" in table
-    assert "failures            never_grasped 3" in table
+    assert re.search(r"^success +0/3  0\.0% \(95 % interval 0\.0% to 56\.1%\)$", table, re.M)
+    assert re.search(r"^failures +never_grasped 3$", table, re.M)
     results = read_results(once)
     assert [result.seed for result in results] == [1000, 1001, 1002]
-    assert {(r.policy, r.arm, r.train_seed, r.steps) for r in results} == {
+    assert {(r.policy, r.condition, r.train_seed, r.steps) for r in results} == {
         ("Mlp", "current_pred_h2", 3, 30)
     }
     assert all(len(result.checkpoint) == 64 and result.versions["torch"] for result in results)
     summary = json.loads((once / "summary.json").read_text())
     assert (summary["episodes"], summary["failures"]["never_grasped"]) == (3, 3)
 
-    evaluate(options(run_folder, "--seed 1001 --num_episodes 1 --num_envs 1", out=pieces))
+    evaluate(config(run_folder, "--seed 1001 --num_episodes 1 --num_envs 1", out=pieces))
     kept = (pieces / "results.jsonl").read_text()
-    evaluate(options(run_folder, "--num_envs 3 --workers 1", out=pieces))
+    evaluate(config(run_folder, "--num_envs 3 --workers 1", out=pieces))
     assert (pieces / "results.jsonl").read_bytes() == (once / "results.jsonl").read_bytes()
     assert kept in (pieces / "results.jsonl").read_text()
     assert json.loads((pieces / "summary.json").read_text())["episodes"] == 3
     # Nothing left to do: the same table, nothing rewritten differently.
     capsys.readouterr()
-    evaluate(options(run_folder, out=pieces))
-    assert "speed               -" in capsys.readouterr().out
+    main(command_line(run_folder, out=pieces))
+    assert re.search(r"^speed +-$", capsys.readouterr().out, re.M)
 
 
-def test_results_of_another_way_of_acting_are_not_mixed(run_folder: Path, tmp_path: Path) -> None:
-    evaluate(options(run_folder, "--num_episodes 1 --execute 3", out=tmp_path))
+def test_results_of_another_execution_are_not_mixed(run_folder: Path, tmp_path: Path) -> None:
+    evaluate(config(run_folder, "--num_episodes 1 --execute 3", out=tmp_path))
     with pytest.raises(RequestError, match="holds results with acting"):
-        evaluate(options(run_folder, "--num_episodes 1", out=tmp_path))
+        evaluate(config(run_folder, "--num_episodes 1", out=tmp_path))
 
 
 def test_killed_and_interrupted_it_goes_on_to_the_same_file(
@@ -117,7 +126,7 @@ def test_killed_and_interrupted_it_goes_on_to_the_same_file(
             time.sleep(0.05)
     done = max(result.seed for result in read_results(out)) - 1000
     for folder in (out, once):
-        evaluate(options(run_folder, out=folder, num_episodes=done + 1))
+        evaluate(config(run_folder, f"--num_episodes {done + 1}", out=folder))
     assert (out / "results.jsonl").read_bytes() == (once / "results.jsonl").read_bytes()
 
 
@@ -147,8 +156,8 @@ def children_of_group(group: int) -> list[int]:
         ("--cameras top,angle", "trained with cameras none, not top,angle"),
         ("--image_size 24x32", "trained with image_size 480x640, not 24x32"),
         ("--checkpoint nowhere", "checkpoint 'nowhere' does not exist"),
-        ("--temporal_ensemble --execute 2", "--temporal_ensemble and --execute: say one"),
-        ("--execute 0", "execute 0"),
+        ("--temporal_ensemble --execute 2", "--temporal_ensemble and --n_action_steps: give one"),
+        ("--n_action_steps 0", "n_action_steps 0"),
         ("--execute 7", "execute 7: must be 1 to 6"),
         ("--num_envs 0", "num_envs 0"),
         ("--workers -1", "workers -1"),
@@ -159,16 +168,21 @@ def children_of_group(group: int) -> list[int]:
         ("--precision fp8", "unknown precision 'fp8'"),
         ("--clips me", "unknown clip 'me'"),
         ("--error uniform", "trained with no corruption, not with error uniform, stats_sha256"),
-        ("--delay 3", "not with delay 3; leave the options as trained, or say --change_corruption"),
+        (
+            "--delay 3",
+            "not with delay 3; leave the options as trained, or give --change_corruption",
+        ),
         ("--change_corruption --error some", "unknown error model 'some'"),
         ("--change_corruption --error uniform --error_stats no.json", "'no.json' cannot be read"),
         ("--face_motion no", "unknown face motion 'no'"),
+        ("--no_object_pose", "trained with object_pose True, not False"),
+        ("--arms both", "trained with arms right, not both"),
     ],
 )
 def test_wrong_requests(run_folder: Path, tmp_path: Path, text: str, message: str) -> None:
     out = tmp_path / "out"
     with pytest.raises(RequestError) as raised:
-        evaluate(options(run_folder, f"{text} --out {out}"))
+        evaluate(config(run_folder, f"{text} --out {out}"))
     assert message in str(raised.value)
     assert not (out / "results.jsonl").exists() or not read_results(out)
 
@@ -180,7 +194,7 @@ def test_wrong_requests(run_folder: Path, tmp_path: Path, text: str, message: st
         ("FeedingEnv --policy Act", "which checkpoint?"),
         ("FeedinEnv --policy Act", "unknown environment 'FeedinEnv'"),
         ("FeedingEnv --scripted --checkpoint runs/x", "--checkpoint goes with --policy"),
-        ("FeedingEnv --scripted --execute 3", "--execute goes with --policy"),
+        ("FeedingEnv --scripted --execute 3", "--n_action_steps goes with --policy"),
         ("FeedingEnv --scripted --delay 3", "--delay goes with --policy"),
         ("FeedingEnv --scripted --no_corruption", "--no_corruption goes with --policy"),
     ],
@@ -213,33 +227,48 @@ def test_an_environment_that_does_not_fit_is_refused(
 ) -> None:
     make_checkpoint(tmp_path / "other", **changes)
     with pytest.raises(RequestError, match=message) as raised:
-        plan(options(tmp_path / "other"))
+        EvaluationPlan.of(config(tmp_path / "other"))
     assert "0.0.9" in str(raised.value)
 
 
 def test_seeds_of_demonstrations_are_pointed_out(
     run_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    evaluate(options(run_folder, "--seed 2", out=tmp_path))
+    evaluate(config(run_folder, "--seed 2", out=tmp_path))
     assert "1 of the seeds are also seeds of the demonstrations (the first is 2)" in caplog.text
 
 
-def test_the_checkpoint_says_how_to_act_unless_told_otherwise() -> None:
+def test_the_execution_is_the_trained_one_unless_changed() -> None:
     trained = Acting(temporal_ensemble=False, decay=0.1, execute=4)
-    assert choose_acting(trained, PolicyOptions()) == trained
-    assert choose_acting(trained, PolicyOptions(execute=2)) == replace(trained, execute=2)
-    ensemble = choose_acting(trained, PolicyOptions(temporal_ensemble=True))
+    assert choose_execution(trained, False, None) == trained
+    assert choose_execution(trained, False, 2) == replace(trained, execute=2)
+    ensemble = choose_execution(trained, True, None)
     assert (ensemble.temporal_ensemble, ensemble.decay) == (True, 0.1)
 
 
 def test_options_of_the_environment_come_from_the_demonstrations(
     run_folder: Path, make_checkpoint: MakeCheckpoint, tmp_path: Path
 ) -> None:
-    make_checkpoint(tmp_path / "late", dataset={"env_kwargs": {"face_motion": "after_lift"}})
-    assert plan(options(tmp_path / "late")).task.env_kwargs == {"face_motion": "after_lift"}
-    given = plan(options(tmp_path / "late", "--face_motion episode"))
-    assert given.task.env_kwargs == {"face_motion": "episode"}
-    assert plan(options(run_folder)).seeds == range(1000, 1003)
+    late = tmp_path / "late"
+    make_checkpoint(late, dataset={"env_kwargs": {"face_motion": "after_lift"}})
+    assert EvaluationPlan.of(config(late)).env.env_kwargs == {"face_motion": "after_lift"}
+    given = EvaluationPlan.of(config(late, "--face_motion episode"))
+    assert given.env.env_kwargs == {"face_motion": "episode"}
+    assert config(run_folder).seeds == range(1000, 1003)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "--no_corruption",
+        "--change_corruption --error uniform --delay 3 --video 2",
+        "--n_action_steps 3 --clips clm_cap12 clm_cap13 --out here --seed 7",
+    ],
+)
+def test_a_configuration_is_json(run_folder: Path, text: str) -> None:
+    asked = config(run_folder, text)
+    assert EvaluationConfig.from_json(json.loads(json.dumps(asked.to_json()))) == asked
 
 
 def test_the_corruption_is_the_trained_one_unless_changed(
@@ -250,28 +279,28 @@ def test_the_corruption_is_the_trained_one_unless_changed(
     run = tmp_path / "mlp_run"
     make_checkpoint(run, spec=spec)
 
-    def planned(text: str = "", folder: Path = run) -> tuple[Corruption | None, str, str]:
-        evaluation = plan(options(folder, text))
-        return evaluation.task.spec.corruption, evaluation.arm, evaluation.out.name
+    def planned(text: str = "", folder: Path = run) -> tuple[Corruption, str, str]:
+        plan = EvaluationPlan.of(config(folder, text))
+        return plan.env.spec.corruption, plan.condition, plan.out.name
 
-    arm, out = "current_pred_h2_uniform_delay2", "FeedingEnv_mlp_run"
-    assert planned() == (trained, arm, out)
-    assert planned("--error uniform --delay 2") == (trained, arm, out)
+    name, out = "current_pred_h2_uniform_delay2", "FeedingEnv_mlp_run"
+    assert planned() == (trained, name, out)
+    assert planned("--error uniform --delay 2") == (trained, name, out)
     copy = tmp_path / "copy.json"
     copy.write_bytes(DEFAULT_STATS.read_bytes())
     same = replace(trained, error_stats=str(copy))
-    assert planned(f"--error_stats {copy}") == (same, arm, out)
+    assert planned(f"--error_stats {copy}") == (same, name, out)
     with pytest.raises(RequestError, match=r"trained with error uniform, stats_sha256 .*, delay 2"):
         planned("--delay 3")
     assert planned("--change_corruption --delay 3") == (
         replace(trained, delay=3),
-        f"{arm}_under_uniform_delay3",
+        f"{name}_under_uniform_delay3",
         f"{out}_under_uniform_delay3",
     )
-    truth = (None, f"{arm}_under_truth", f"{out}_under_truth")
+    truth = (Corruption(), f"{name}_under_truth", f"{out}_under_truth")
     assert planned("--no_corruption") == truth
     assert planned("--change_corruption --error none --delay 0") == truth
-    assert planned("--no_corruption", run_folder) == (None, "current_pred_h2", out)
+    assert planned("--no_corruption", run_folder) == (Corruption(), "current_pred_h2", out)
     late = planned("--change_corruption --delay 1", run_folder)
     assert late == (Corruption(delay=1), "current_pred_h2_under_delay1", f"{out}_under_delay1")
 
@@ -280,26 +309,26 @@ def test_another_corruption_gives_other_episodes_in_another_folder(
     run_folder: Path, tmp_path: Path
 ) -> None:
     plain, noisy = tmp_path / "plain", tmp_path / "noisy"
-    evaluate(options(run_folder, "--num_episodes 2", out=plain))
+    evaluate(config(run_folder, "--num_episodes 2", out=plain))
     changed = "--num_episodes 2 --change_corruption --error uniform --face_dropout 0.3"
-    evaluate(options(run_folder, changed, out=noisy))
+    evaluate(config(run_folder, changed, out=noisy))
     results = read_results(noisy)
-    assert {result.arm for result in results} == {"current_pred_h2_under_uniform_dropout0.3"}
+    assert {result.condition for result in results} == {"current_pred_h2_under_uniform_dropout0.3"}
     settings = json.loads((noisy / "evaluation.json").read_text())["settings"]
     assert settings["observation"]["corruption"]["face_dropout"] == 0.3
     assert settings["observation"]["corruption"]["stats_sha256"] == load_error_stats().sha256
     before = (noisy / "results.jsonl").read_bytes()
-    evaluate(options(run_folder, f"{changed} --num_envs 1 --workers 1", out=noisy))
+    evaluate(config(run_folder, f"{changed} --num_envs 1 --workers 1", out=noisy))
     assert (noisy / "results.jsonl").read_bytes() == before
     with pytest.raises(RequestError, match="holds results with observation"):
-        evaluate(options(run_folder, "--num_episodes 2", out=noisy))
-    assert {result.arm for result in read_results(plain)} == {"current_pred_h2"}
+        evaluate(config(run_folder, "--num_episodes 2", out=noisy))
+    assert {result.condition for result in read_results(plain)} == {"current_pred_h2"}
 
 
 def test_names() -> None:
-    assert arm_name(ObservationSpec()) == "baseline"
-    assert arm_name(ObservationSpec(obs="current_pred", horizon=5)) == "current_pred_h5"
-    noisy = ObservationSpec(obs="current_pred", horizon=3, corruption=Corruption("uniform"))
-    assert arm_name(noisy) == "current_pred_h3_uniform"
+    assert ObservationSpec().name == "baseline"
+    assert ObservationSpec("current_pred", horizon=5).name == "current_pred_h5"
+    noisy = ObservationSpec("current_pred", horizon=3, corruption=Corruption("uniform"))
+    assert noisy.name == "current_pred_h3_uniform"
     assert run_name(Path("runs/act_current")) == "act_current"
     assert run_name(Path("runs/x/checkpoints/step_00000005")) == "x_step_00000005"

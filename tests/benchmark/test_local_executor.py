@@ -1,4 +1,4 @@
-"""Units in processes, with the stub's work: same bytes however many, stopped wherever."""
+"""Items in processes, with the stub's work: same bytes however many, stopped wherever."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ from typing import Any
 
 import pytest
 
-from robo_manip_baselines.benchmark import worker as work
-from robo_manip_baselines.benchmark.local import LocalExecutor, start_worker
+from robo_manip_baselines.benchmark import worker
 from robo_manip_baselines.benchmark.plan import Plan
-from robo_manip_baselines.benchmark.scheduler import Outcome, Progress, UnitsFailedError, run_units
-from robo_manip_baselines.benchmark.work_item import Store, write_note
+from robo_manip_baselines.benchmark.scheduler import (
+    GridProgress,
+    ItemsFailedError,
+    LocalExecutor,
+    WorkResult,
+    run_items,
+)
+from robo_manip_baselines.benchmark.work_item import ArtifactStore, write_manifest
 
-from .conftest import do, outcome
+from .conftest import contents, do
 
 pytestmark = pytest.mark.long
 
@@ -30,34 +35,34 @@ TIMEOUT = 60.0  # seconds; hangs fail, slow machines do not
 def test_two_workers_in_another_order_come_to_the_same_bytes(
     stub_plan: Plan, reference: dict[str, bytes], tmp_path: Path
 ) -> None:
-    units = list(stub_plan.units())
-    random.Random(1).shuffle(units)
-    units.sort(key=lambda unit: ("demonstrations", "training", "evaluation").index(unit.kind))
-    do(stub_plan, tmp_path / "two", 2, units)
-    assert outcome(tmp_path / "two") == reference
+    items = list(stub_plan.items())
+    random.Random(1).shuffle(items)
+    items.sort(key=lambda item: ("demonstrations", "training", "evaluation").index(item.kind))
+    do(stub_plan, tmp_path / "two", 2, items)
+    assert contents(tmp_path / "two") == reference
     lines = reference["results.jsonl"].decode().splitlines()
     assert len(lines) == 3 * 6
-    assert {"report.html", "versions.json", "commands.txt", "tables/success.md"} <= set(reference)
+    assert {"report.html", "versions.json", "configs.json", "tables/success.md"} <= set(reference)
     assert "Prediction, late" in reference["tables/success.md"].decode()
 
 
-def test_units_leave_nothing_but_what_they_made(stub_plan: Plan, reference_folder: Path) -> None:
-    store = Store(reference_folder / "units")
+def test_items_leave_nothing_but_what_they_made(stub_plan: Plan, reference_folder: Path) -> None:
+    store = ArtifactStore(reference_folder / "items")
     training = stub_plan.runs[0].training
     names = {path.name for path in store.folder(training).iterdir()}
-    assert names == {"out", "unit.json", "log.txt", ".lock"}
-    assert set(store.files(training)) == {"state.json"}
-    assert oct(store.files(training)["state.json"].stat().st_mode & 0o444) == oct(0o444)
+    assert names == {"out", "item.json", "log.txt", ".lock"}
+    assert set(store.outputs(training)) == {"state.json"}
+    assert oct(store.outputs(training)["state.json"].stat().st_mode & 0o444) == oct(0o444)
 
 
 DRIVER = """
 import sys
 from pathlib import Path
 from robo_manip_baselines.benchmark import plan as plan_module
-plan_module._WORK = "stub_work"
+plan_module._FUNCTIONS = "stub_work"
 sys.path.insert(0, {tests!r})
-from conftest import ARMS, PRESET, do
-do(plan_module.make_plan("FeedingEnv", ARMS, PRESET), Path({out!r}), 2)
+from conftest import CONDITIONS, PRESET, do
+do(plan_module.make_plan("FeedingEnv", CONDITIONS, PRESET), Path({out!r}), 2)
 """
 
 
@@ -73,7 +78,7 @@ def wait_for(pattern: str, out: Path, driver: subprocess.Popen[bytes], holds: st
     end = time.monotonic() + TIMEOUT
     while True:
         for path in out.glob(pattern):
-            if holds in path.read_text() and not (path.parents[1] / "unit.json").exists():
+            if holds in path.read_text() and not (path.parents[1] / "item.json").exists():
                 return path
         assert driver.poll() is None, "it ended before it could be killed"
         assert time.monotonic() < end
@@ -85,8 +90,8 @@ def test_killed_in_a_training_and_in_an_evaluation_it_comes_to_the_same(
 ) -> None:
     out = tmp_path / "killed"
     for pattern, holds in (
-        ("units/training/*/out/state.json", ", 3]"),
-        ("units/evaluation/*/out/results.jsonl", "\n"),
+        ("items/training/*/out/state.json", ", 3]"),
+        ("items/evaluation/*/out/results.jsonl", "\n"),
     ):
         driver = start_driver(out)
         begun = wait_for(pattern, out, driver, holds)
@@ -94,16 +99,16 @@ def test_killed_in_a_training_and_in_an_evaluation_it_comes_to_the_same(
         driver.wait()
         kept = begun.read_text()
     do(stub_plan, out, 2)  # kept: an evaluation of which only some lines were there
-    assert outcome(out) == reference
+    assert contents(out) == reference
     assert begun.read_text().startswith(kept)
-    logs = [path.read_text() for path in out.glob("units/training/*/log.txt")]
+    logs = [path.read_text() for path in out.glob("items/training/*/log.txt")]
     assert sum("goes on at" in log for log in logs) >= 1
 
 
 def test_workers_end_with_whoever_started_them(stub_plan: Plan, tmp_path: Path) -> None:
     out = tmp_path / "orphans"
     driver = start_driver(out)
-    state = wait_for("units/training/*/out/state.json", out, driver, ", 2]")
+    state = wait_for("items/training/*/out/state.json", out, driver, ", 2]")
     driver.kill()
     driver.wait()
     end = time.monotonic() + TIMEOUT
@@ -120,14 +125,14 @@ def test_the_last_words_of_a_unit_that_fails_are_passed_on(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("STUB_FAIL", "--delay")
-    units = stub_plan.units()
-    store = Store(tmp_path)
+    monkeypatch.setenv("STUB_FAIL", "delay")
+    items = stub_plan.items()
+    store = ArtifactStore(tmp_path)
     executor = LocalExecutor(store, 2)
-    with pytest.raises(UnitsFailedError, match=r"1 units failed.*training late_seed0"):
-        run_units(units, store, executor, Progress(units, 2, bar=False))
+    with pytest.raises(ItemsFailedError, match=r"1 work items failed.*training late_seed0"):
+        run_items(items, store, executor, GridProgress(items, 2, bar=False))
     assert "RuntimeError: the stub fails (all of it: " in caplog.text
-    missing = {unit.name for unit in units if not store.is_done(unit)}
+    missing = {item.name for item in items if not store.is_done(item)}
     assert missing == {"late_seed0", "late_seed0_001000", "late_seed0_001003"}
 
 
@@ -145,28 +150,28 @@ def test_other_software_is_refused(
     other: dict[str, Any],
     words: str,
 ) -> None:
-    store = Store(tmp_path)
-    unit = stub_plan.units()[0]
-    told = {**unit.document(), **other}
-    monkeypatch.setitem(unit.__dict__, "document", lambda: told)
+    store = ArtifactStore(tmp_path)
+    item = stub_plan.items()[0]
+    request = {**item.to_json(), **other}
+    monkeypatch.setitem(item.__dict__, "document", lambda: request)
     executor = LocalExecutor(store, 1)
-    executor.start(unit)
+    executor.start(item)
     (ended,) = wait(executor)
     assert ended.code == 2
     assert words in ended.problem
 
 
 def test_a_unit_that_another_process_does_is_waited_for(stub_plan: Plan, tmp_path: Path) -> None:
-    store, unit = Store(tmp_path), stub_plan.units()[0]
-    folder = store.prepare(unit)
+    store, item = ArtifactStore(tmp_path), stub_plan.items()[0]
+    folder = store.prepare(item)
     executor = LocalExecutor(store, 1)
     with (folder / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        executor.start(unit)
+        executor.start(item)
         time.sleep(3.0)  # long enough to do it, if it did not wait
         assert not (folder / "out").exists()
-        write_note(folder, unit.document(), [], 1.0)
-    assert wait(executor) == [Outcome(unit)]
+        write_manifest(folder, item.to_json(), [], 1.0)
+    assert wait(executor) == [WorkResult(item)]
     assert not (folder / "out").exists()  # found done
 
 
@@ -176,7 +181,7 @@ def test_a_scratch_folder_goes_with_whoever_started_the_unit(
     monkeypatch.setenv("STUB_PAUSE", "100")
     folder = tmp_path / "scratch"
     (folder / "demonstrations").mkdir(parents=True)
-    process = start_worker(stub_plan.runs[0].training.document(), folder, is_scratch=True)
+    process = worker.start_worker(stub_plan.runs[0].training.to_json(), folder, is_scratch=True)
     end = time.monotonic() + TIMEOUT
     while not (folder / "out" / "state.json").exists():
         assert time.monotonic() < end
@@ -189,7 +194,7 @@ def test_a_scratch_folder_goes_with_whoever_started_the_unit(
 
 def test_a_worker_that_is_never_told_what_to_do_ends_and_cleans_up(tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", work.__name__, work.SCRATCH],
+        [sys.executable, "-m", worker.__name__, worker.SCRATCH],
         cwd=tmp_path,
         stdin=subprocess.DEVNULL,
     )
@@ -201,17 +206,17 @@ def test_ctrl_c_ends_everything_and_the_rest_is_done_later(
     stub_plan: Plan, reference: dict[str, bytes], tmp_path: Path
 ) -> None:
     driver = start_driver(tmp_path)
-    state = wait_for("units/training/*/out/state.json", tmp_path, driver, ", 2]")
+    state = wait_for("items/training/*/out/state.json", tmp_path, driver, ", 2]")
     os.killpg(driver.pid, signal.SIGINT)  # a terminal sends it to all of them
     assert driver.wait(TIMEOUT) != 0
     kept = state.read_text()
     do(stub_plan, tmp_path, 2)
-    assert outcome(tmp_path) == reference
+    assert contents(tmp_path) == reference
     log = (state.parents[1] / "log.txt").read_text()
     assert f"goes on at {kept.rpartition(', ')[2].rstrip(']')}" in log
 
 
-def wait(executor: LocalExecutor) -> list[Outcome]:
+def wait(executor: LocalExecutor) -> list[WorkResult]:
     while not (ended := list(executor.wait())):
         pass
     return ended

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
-from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS, FeedingExpert
-from robo_manip_baselines.envs.mujoco.tasks.feeding.success import Phase, Progress
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import FeedingProgress, Phase
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 
 
@@ -26,7 +26,7 @@ def world(request: pytest.FixtureRequest) -> Iterator[FeedingEnv]:
 def cube_in_gripper(world: FeedingEnv) -> np.ndarray:
     """(3,) m: the cube's centre in the frame of the gripper."""
     gripper = mink.SO3(world.gripper_orientation)
-    return gripper.inverse().apply(world.object_position() - world.gripper_position)
+    return gripper.inverse().apply(world.cube_position - world.gripper_position)
 
 
 def cube_touches_face(world: FeedingEnv) -> bool:
@@ -35,9 +35,9 @@ def cube_touches_face(world: FeedingEnv) -> bool:
     return bool(inside[world.data.contact.geom].any())
 
 
-def feed(world: FeedingEnv, expert: str, seed: int) -> tuple[Progress, list[np.ndarray]]:
+def feed(world: FeedingEnv, expert: str, seed: int) -> tuple[FeedingProgress, list[np.ndarray]]:
     """Play an episode; return how it went, and the cube in the gripper while only that held it."""
-    actor = FeedingExpert(world, EXPERTS[expert])
+    actor = ENTRY.make_expert(expert, world)
     world.reset(seed=seed)
     actor.reset()
     carried, touched = [], False
@@ -51,7 +51,7 @@ def feed(world: FeedingEnv, expert: str, seed: int) -> tuple[Progress, list[np.n
     return world.progress, carried
 
 
-@pytest.mark.parametrize("expert", sorted(EXPERTS))
+@pytest.mark.parametrize("expert", sorted(ENTRY.experts))
 def test_feeds_and_lets_go(world: FeedingEnv, expert: str) -> None:
     progress, carried = feed(world, expert, seed=0)
     assert progress.is_success
@@ -62,7 +62,7 @@ def test_feeds_and_lets_go(world: FeedingEnv, expert: str) -> None:
 
 
 def test_the_face_waits_for_the_lift_or_does_not(world: FeedingEnv) -> None:
-    actor = FeedingExpert(world, EXPERTS["reactive"])
+    actor = ENTRY.make_expert("reactive", world)
     world.reset(seed=1)
     actor.reset()
     start = world.mouth_track[0]
@@ -87,7 +87,7 @@ def test_the_face_waits_for_the_lift_or_does_not(world: FeedingEnv) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("expert", sorted(EXPERTS))
+@pytest.mark.parametrize("expert", sorted(ENTRY.experts))
 def test_at_least_48_of_50_episodes_succeed(expert: str) -> None:
     env = make_env("FeedingEnv", cameras=())
     assert isinstance(env.unwrapped, FeedingEnv)

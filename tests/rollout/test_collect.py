@@ -1,4 +1,4 @@
-"""Collecting demonstrations: same files in any number of processes, killed or not."""
+"""Demonstrations: same files from any number of processes, killed or not."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robo_manip_baselines.commands.rollout import RolloutOptions, to_collection
+from robo_manip_baselines.commands.rollout import parse_options, to_collection
 from robo_manip_baselines.data import (
     EpisodeReader,
     list_episodes,
     read_metadata,
     write_episode,
 )
-from robo_manip_baselines.data.schema import ATTRIBUTES
+from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
@@ -33,12 +33,12 @@ from robo_manip_baselines.runs.errors import RequestError
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parents[2]
-OPTIONS = RolloutOptions("FeedingEnv", scripted=True, num_episodes=3, cameras=("none",), workers=1)
 ARGUMENTS = ["FeedingEnv", "--scripted", "--num_episodes", "3", "--cameras", "none"]
 
 
-def collection(out: Path, **changes: Any) -> Collection:
-    return replace(to_collection(replace(OPTIONS, out=out)), **changes)
+def collection(out: Path, *more: str, **changes: Any) -> Collection:
+    options, _ = parse_options([*ARGUMENTS, "--workers", "1", "--out", str(out), *more])
+    return replace(to_collection(options), **changes)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,8 @@ def test_the_replay_reproduces_every_recorded_state(folder: Path) -> None:
 def test_a_replay_that_strays_is_noticed(folder: Path, tmp_path: Path) -> None:
     with EpisodeReader(list_episodes(folder)[0]) as episode:
         arrays, known = episode.arrays, episode.attributes
-    derived = {item.name for item in ATTRIBUTES if item.derived}
+        schema = EpisodeSchema.of(episode.task)
+    derived = {item.name for item in schema.attributes if item.is_derived}
     arrays["action"][50, 0] += 0.01  # rad
     path = tmp_path / "episode_000000.hdf5"
     write_episode(path, arrays, {}, {k: v for k, v in known.items() if k not in derived})
@@ -96,6 +97,14 @@ def test_the_files_are_whole_and_say_what_happened(folder: Path) -> None:
         np.testing.assert_allclose(np.diff(clock), 0.02, atol=1e-9)
 
 
+def test_a_collection_is_json(tmp_path: Path) -> None:
+    asked = collection(tmp_path, "--seed", "5", "--clips", "clm_cap12", workers=2)
+    again = Collection.from_json(json.loads(json.dumps(asked.to_json())))
+    assert again == asked
+    assert again.env_kwargs["clips"] == ["clm_cap12"]
+    assert again.seeds == range(5, 8)
+
+
 def test_carries_on_where_it_was(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "some"
     shutil.copytree(folder, out)
@@ -114,7 +123,7 @@ def test_refuses_to_mix_settings(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="holds episodes with expert reactive, not anticip"):
         collect(collection(out, expert="anticipatory"))
     with pytest.raises(RequestError, match="holds episodes with env_kwargs"):
-        collect(to_collection(replace(OPTIONS, out=out, face_motion="after_lift")))
+        collect(collection(out, "--face_motion", "after_lift"))
 
 
 def test_killed_and_continued_it_ends_with_the_same_files(folder: Path, tmp_path: Path) -> None:
@@ -154,6 +163,8 @@ def test_killed_and_continued_it_ends_with_the_same_files(folder: Path, tmp_path
         (["FeedingEnv", "--scripted", "--face_motion", "no"], "unknown face motion 'no'"),
         (["FeedingEnv", "--scripted", "--motion_library", "no.npz"], "'no.npz' does not exist"),
         (["FeedingEnv", "--scripted", "--sedd", "1"], "--sedd"),
+        (["FeedingEnv", "--scripted", "--obs", "current"], "--obs goes with --policy"),
+        (["FeedingEnv", "--scripted", "--arms", "both"], "arms both: the expert 'reactive' gives"),
         (["FeedingEnv", "--scripted", "--out", "/proc/nowhere"], "/proc/nowhere"),
     ],
 )

@@ -13,19 +13,19 @@ from robo_manip_baselines.envs.mujoco.expert.phases import (
     DOWN,
     Approach,
     Command,
+    ExpertView,
     Follow,
     Grip,
     Reach,
-    View,
     least_jerk,
     level_at,
 )
 
-STILL = View(
+STILL = ExpertView(
     object_position=np.array([0.15, 0.5, 0.02]),
-    mouth_track=np.tile([0.0, 0.5, 0.35], (6, 1)),
-    time_since_lift=0.0,
-    is_at_mouth=False,
+    target_track=np.tile([0.0, 0.5, 0.35], (6, 1)),
+    elapsed=0.0,
+    is_at_target=False,
 )
 START = Command(np.array([0.2, 0.45, 0.3]), DOWN, 0.021)
 
@@ -84,7 +84,7 @@ def test_approach_is_algorithm_1() -> None:
     for step in range(290):
         t = 0.5 + 0.02 * step if step < 270 else 5.9
         mouth = np.array([0.0, 0.5, 0.35]) + 0.02 * rng.standard_normal(3)
-        view = replace(STILL, mouth_track=np.tile(mouth, (6, 1)), time_since_lift=t)
+        view = replace(STILL, target_track=np.tile(mouth, (6, 1)), elapsed=t)
         gripper = gripper + (mouth - gripper) / (6.0 - t) * 0.02
         np.testing.assert_allclose(phase.step(view).position, gripper, atol=1e-12)
 
@@ -93,33 +93,33 @@ def test_approach_arrives_exactly_when_the_time_is_up() -> None:
     phase = Approach(limit=6.0)
     phase.start(STILL, START)
     for step in range(300):
-        command = phase.step(replace(STILL, time_since_lift=0.02 * step))
+        command = phase.step(replace(STILL, elapsed=0.02 * step))
     np.testing.assert_allclose(command.position, [0.0, 0.5, 0.35], atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("time_since_lift", "is_at_mouth", "done"),
+    ("elapsed", "is_at_target", "done"),
     [(0.0, False, False), (6.0, False, False), (6.02, False, True), (1.0, True, True),
      (None, False, True)],
 )  # fmt: skip
-def test_approach_ends(time_since_lift: float | None, is_at_mouth: bool, done: bool) -> None:
+def test_approach_ends(elapsed: float | None, is_at_target: bool, done: bool) -> None:
     phase = Approach(limit=6.0)
-    view = replace(STILL, time_since_lift=time_since_lift, is_at_mouth=is_at_mouth)
+    view = replace(STILL, elapsed=elapsed, is_at_target=is_at_target)
     assert phase.is_done(view) is done
 
 
 @given(st.floats(0.0, 5 / 30))
-def test_the_mouth_ahead_is_interpolated(lead: float) -> None:
+def test_the_target_ahead_is_interpolated(lead: float) -> None:
     track = np.random.default_rng(0).random((6, 3))
     low = min(int(lead * 30), 4)
     share = lead * 30 - low
     expected = (1 - share) * track[low] + share * track[low + 1]
-    np.testing.assert_allclose(replace(STILL, mouth_track=track).mouth(lead), expected, atol=1e-9)
+    np.testing.assert_allclose(replace(STILL, target_track=track).target(lead), expected, atol=1e-9)
 
 
 def test_lead_aims_at_the_future() -> None:
     track = np.linspace([0.0, 0.5, 0.35], [0.0, 0.55, 0.35], 6)  # 0.3 m/s along y
-    view = replace(STILL, mouth_track=track, time_since_lift=5.9)
+    view = replace(STILL, target_track=track, elapsed=5.9)
     now, later = Approach(), Approach(lead=0.1)
     for phase in (now, later):
         phase.start(view, START)
@@ -150,7 +150,7 @@ def test_follow_closes_the_gap_no_faster_than_it_may() -> None:
     np.testing.assert_allclose(last, [0.03, 0.5, 0.35], atol=1e-12)
 
 
-def test_near_the_mouth_the_gripper_is_level() -> None:
+def test_near_the_target_the_gripper_is_level() -> None:
     for phase in (Approach(), Follow(np.zeros(3), 1.0)):
         phase.start(STILL, START)
         command = phase.step(STILL)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.rollout.results import (
     MANIFEST,
     RESULTS,
@@ -26,17 +27,20 @@ MISS = EpisodeResult(
     is_success=False,
     is_success_strict=False,
     completion_time=None,
-    time_since_lift=8.02,
     steps=600,
     failure="missed_low",
-    closest_distance=0.0123,
-    closest_offset=(0.001, -0.002, -0.012),
-    cube_offset=(-0.011, -0.003, -0.01),
-    face_force=1.5,
     motion_clip="clip",
     motion_subject="person",
+    columns={
+        "time_since_lift": 8.02,
+        "closest_distance": 0.0123,
+        "closest_offset": (0.001, -0.002, -0.012),
+        "cube_offset": (-0.011, -0.003, -0.01),
+        "face_force": 1.5,
+    },
     policy="Act",
-    arm="current_pred_h2",
+    condition="current_pred_h2",
+    observation=ObservationSpec("current_pred").to_json() | {"cameras": [], "image_size": [48, 64]},
     train_seed=0,
     checkpoint="ab12",
     versions={"numpy": "2"},
@@ -44,11 +48,8 @@ MISS = EpisodeResult(
 NEVER = replace(
     MISS,
     seed=1001,
-    time_since_lift=None,
     failure="never_grasped",
-    closest_distance=None,
-    closest_offset=None,
-    cube_offset=None,
+    columns={**dict.fromkeys(MISS.columns), "face_force": 0.0},
 )
 HIT = replace(MISS, seed=1002, is_success=True, completion_time=4.0, failure="")
 
@@ -70,6 +71,8 @@ def test_a_line_gives_the_result_back(result: EpisodeResult) -> None:
         ({"cube_offset": 0.0}, "'cube_offset' is"),
         ({"failure": "bored"}, "'failure' is \"bored\""),
         ({"versions": {"numpy": 2}}, "'versions' is"),
+        ({"observation": 3}, "'observation' is"),
+        ({"version": 3}, "'version' is 3; this release reads 1 and 2"),
         ({"mood": "good"}, "'mood' is unknown"),
     ],
 )
@@ -87,11 +90,18 @@ def test_a_line_without_a_field_is_refused() -> None:
 
 def test_numbers_that_json_does_not_know_are_not_written() -> None:
     with pytest.raises(ValueError, match="JSON"):
-        replace(MISS, face_force=float("nan")).to_line()
+        replace(MISS, columns={**MISS.columns, "face_force": float("nan")}).to_line()
+
+
+def test_rows_of_version_1_are_read() -> None:
+    values = json.loads(MISS.to_line())
+    del values["version"], values["observation"]
+    values["arm"] = values.pop("condition")
+    assert EpisodeResult.from_line(json.dumps(values)) == replace(MISS, observation=None)
 
 
 def open_file(folder: Path, **changes: Any) -> ResultsFile:
-    return ResultsFile(folder, {**SETTINGS, **changes}, {"arm": "current"})
+    return ResultsFile(folder, {**SETTINGS, **changes}, {"condition": "current"})
 
 
 def test_lines_are_there_at_once_and_by_seed_in_the_end(tmp_path: Path) -> None:
@@ -104,7 +114,7 @@ def test_lines_are_there_at_once_and_by_seed_in_the_end(tmp_path: Path) -> None:
     lines = (tmp_path / RESULTS).read_text().splitlines()
     assert lines == [NEVER.to_line(), MISS.to_line()]
     manifest = json.loads((tmp_path / MANIFEST).read_text())
-    assert manifest["arm"] == "current"
+    assert manifest["condition"] == "current"
 
 
 @pytest.mark.parametrize("cut", [1, 50, 10_000])

@@ -12,13 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.benchmark.aggregation import write_results
-from robo_manip_baselines.benchmark.conditions import ArmLine
-from robo_manip_baselines.benchmark.local import LocalExecutor
-from robo_manip_baselines.benchmark.plan import make_plan
-from robo_manip_baselines.benchmark.presets import Preset
-from robo_manip_baselines.benchmark.scheduler import Progress, run_units
-from robo_manip_baselines.benchmark.work_item import Store
+from robo_manip_baselines.benchmark.aggregation import aggregate_results
+from robo_manip_baselines.benchmark.conditions import ConditionConfig
+from robo_manip_baselines.benchmark.plan import BenchmarkPreset, make_plan
+from robo_manip_baselines.benchmark.scheduler import GridProgress, LocalExecutor, run_items
+from robo_manip_baselines.benchmark.work_item import ArtifactStore
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
@@ -27,30 +25,34 @@ from robo_manip_baselines.policy.checkpoint import read_checkpoint
 pytestmark = pytest.mark.slow
 
 # Slow enough to be killed on the way: many layers, saved often.
-TRAINING = (
-    *("--steps", "200", "--checkpoint_every", "40", "--log_every", "5", "--batch_size", "4"),
-    *("--hidden_layers", "9", "--dropout", "0.3"),
-)
-PRESET = Preset(
+TRAINING = {
+    **{"steps": 200, "checkpoint_every": 40, "log_every": 5, "batch_size": 4},
+    **{"hidden_layers": 9, "dropout": 0.3},
+}
+PRESET = BenchmarkPreset(
     train_preset="cpu",
     cameras=(),
     demonstrations=2,
     demonstration_block=1,
     num_episodes=3,
     episode_block=3,
-    train_args=TRAINING,
+    train_settings=TRAINING,
     num_envs=1,
 )
-ARMS = (ArmLine("a", policy="Mlp", horizon=3, error="uniform", delay=1),)
+CONDITIONS = (
+    ConditionConfig.from_yaml(
+        {"name": "a", "policy": "Mlp", "horizon": 3, "error": "uniform", "delay": 1}
+    ),
+)
 TIMEOUT = 300.0  # seconds; hangs fail, slow machines do not
 
 
 def do(out: Path, workers: int) -> None:
-    plan, store = make_plan("FeedingEnv", ARMS, PRESET), Store(out / "units")
-    units = plan.units()
+    plan, store = make_plan("FeedingEnv", CONDITIONS, PRESET), ArtifactStore(out / "items")
+    items = plan.items()
     with closing(LocalExecutor(store, workers)) as executor:
-        run_units(units, store, executor, Progress(units, workers, bar=False))
-    write_results(plan, store, out)
+        run_items(items, store, executor, GridProgress(items, workers, bar=False))
+    aggregate_results(plan, store, out)
 
 
 DRIVER = """
@@ -67,8 +69,8 @@ def test_it_comes_to_the_same_as_without(tmp_path: Path) -> None:
     do(whole, 1)
     program = DRIVER.format(tests=str(Path(__file__).parent), out=str(killed))
     for pattern, lines in (
-        ("units/training/*/out/metrics.jsonl", 15),
-        ("units/evaluation/*/out/results.jsonl", 1),
+        ("items/training/*/out/metrics.jsonl", 15),
+        ("items/evaluation/*/out/results.jsonl", 1),
     ):
         driver = subprocess.Popen([sys.executable, "-c", program])
         end = time.monotonic() + TIMEOUT
@@ -79,10 +81,10 @@ def test_it_comes_to_the_same_as_without(tmp_path: Path) -> None:
         driver.kill()
         driver.wait()
         time.sleep(1.0)  # the workers notice, and end
-        assert not list(killed.glob(f"{Path(pattern).parents[1]}/unit.json"))
+        assert not list(killed.glob(f"{Path(pattern).parents[1]}/item.json"))
     do(killed, 2)
     assert (killed / "results.jsonl").read_bytes() == (whole / "results.jsonl").read_bytes()
-    (log,) = killed.glob("units/training/*/log.txt")
+    (log,) = killed.glob("items/training/*/log.txt")
     assert log.read_text().count("run folder: out") == 2
     assert "of them before" in log.read_text()
 
@@ -92,23 +94,23 @@ def test_files_from_outside_and_forecasts_reach_the_policy(tmp_path: Path) -> No
     stats.write_bytes(DEFAULT_STATS.read_bytes())
     shutil.copy(DEFAULT_LIBRARY, library)
     size = replace(
-        PRESET, num_episodes=1, episode_block=1, train_args=("--steps", "3", "--batch_size", "4")
+        PRESET, num_episodes=1, episode_block=1, train_settings={"steps": 3, "batch_size": 4}
     )
-    arms = (
-        ArmLine("erring", policy="Mlp", error="gaussian"),
-        ArmLine("shuffled", policy="Mlp", prediction="shuffled"),
+    conditions = (
+        ConditionConfig.from_yaml({"name": "erring", "policy": "Mlp", "error": "gaussian"}),
+        ConditionConfig("shuffled", policy="Mlp", prediction="shuffled"),
     )
-    plan = make_plan("FeedingEnv", arms, size, library=library, error_stats=stats)
-    store, units = Store(tmp_path / "units"), plan.units()
+    plan = make_plan("FeedingEnv", conditions, size, library=library, error_stats=stats)
+    store, items = ArtifactStore(tmp_path / "items"), plan.items()
     with closing(LocalExecutor(store, 2)) as executor:
-        run_units(units, store, executor, Progress(units, 2, bar=False))
-    study = write_results(plan, store, tmp_path)
-    assert [figures.arm.name for figures in study.arms] == ["erring", "shuffled"]
+        run_items(items, store, executor, GridProgress(items, 2, bar=False))
+    statistics = aggregate_results(plan, store, tmp_path)
+    assert [c.condition.name for c in statistics.conditions] == ["erring", "shuffled"]
     erring, shuffled = (read_checkpoint(store.folder(run.training) / "out") for run in plan.runs)
     assert erring.spec.corruption
     assert erring.spec.corruption.error_stats == "error_stats.json"
     assert erring.dataset["env_kwargs"]["motion_library"] == "motion_library.npz"
     assert shuffled.spec.corruption == Corruption("model")
     assert shuffled.dataset["env_kwargs"]["motion_library"] == "motion_forecast.npz"
-    left = {path.name for unit in units for path in store.folder(unit).iterdir()}
-    assert left == {"out", "unit.json", "log.txt", ".lock"}
+    left = {path.name for item in items for path in store.folder(item).iterdir()}
+    assert left == {"out", "item.json", "log.txt", ".lock"}

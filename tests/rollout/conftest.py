@@ -1,4 +1,4 @@
-"""A policy that nobody trained, and episodes that are over soon."""
+"""A policy that nobody trained, and short episodes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
 from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
-from robo_manip_baselines.rollout.workers import Task
+from robo_manip_baselines.rollout.workers import EnvConfig
 
 SPEC = ObservationSpec(obs="current_pred", cameras=(), object_pose=True)
 STEPS = 30
@@ -27,22 +27,22 @@ MakeCheckpoint = Callable[..., Checkpoint]
 
 
 @pytest.fixture(scope="session")
-def task() -> Task:
+def env_config() -> EnvConfig:
     """The environment of ``make_checkpoint``."""
-    return Task("FeedingEnv", SPEC, {"max_episode_steps": STEPS})
+    return EnvConfig("FeedingEnv", SPEC, {"max_episode_steps": STEPS})
 
 
 @pytest.fixture(scope="session")
-def make_checkpoint(task: Task) -> MakeCheckpoint:
+def make_checkpoint(env_config: EnvConfig) -> MakeCheckpoint:
     """Write a small perceptron into a folder; it moves the arm about its home pose."""
-    with closing(task.make()) as env:
+    with closing(env_config.make()) as env:
         world = world_of(env)
         names, xml_hash = tuple(world.action_names), world.xml_hash
         middle = world.data.ctrl[world._actuators].astype(np.float32)
 
     def make(folder: Path, **changes: object) -> Checkpoint:
         config = MlpConfig(chunk_size=6, hidden_size=16, hidden_layers=1)
-        sizes = Sizes(task.vector_size, task.action_size, 0, SPEC.image_size)
+        sizes = Sizes(env_config.vector_size, env_config.action_size, 0, SPEC.image_size)
         model = MlpModel(config, sizes)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
@@ -68,7 +68,7 @@ def make_checkpoint(task: Task) -> MakeCheckpoint:
             "train_seed": 3,
             "settings": TrainSettings(steps=5),
             "split": Split(train=(0, 1), validation=(2,)),
-            "dataset": {"env_kwargs": task.env_kwargs},
+            "dataset": {"env_kwargs": env_config.env_kwargs},
             "versions": {"robo_manip_baselines": "0.0.9"},
         }
         checkpoint = Checkpoint(folder=folder, **{**facts, **changes})

@@ -1,0 +1,183 @@
+"""Files of conditions: those that ship, and what is refused in a user's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from robo_manip_baselines.benchmark.conditions import (
+    CONDITIONS,
+    ConditionConfig,
+    read_conditions,
+)
+from robo_manip_baselines.benchmark.plan import PRESETS
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import Corruption, ObservationSpec
+from robo_manip_baselines.runs.errors import RequestError
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+def condition(**values: object) -> ConditionConfig:
+    return ConditionConfig.from_yaml(values)
+
+
+def test_the_shipped_conditions_are_the_papers_twelve_and_four_more() -> None:
+    file = read_conditions(CONDITIONS / "feeding.yaml")
+    assert file.env == "FeedingEnv"
+    published = task_entry("FeedingEnv").load_study().published
+    assert [c.name for c in file.conditions[:12]] == list(published)
+    assert [c.name for c in file.conditions[:12]] == [c.spec.name for c in file.conditions[:12]]
+    assert [(c.spec.corruption.error, c.prediction, c.expert) for c in file.conditions[12:]] == [
+        ("model", "truth", "reactive"),
+        ("none", "persistence", "reactive"),
+        ("none", "shuffled", "reactive"),
+        ("none", "truth", "anticipatory"),
+    ]
+
+
+def test_the_conditions_of_delay_are_a_whole_grid_and_share_their_runs_with_feeding() -> None:
+    late = read_conditions(CONDITIONS / "delay.yaml").conditions
+    cells = [(c.spec.corruption.delay, c.spec.frames - 1) for c in late]
+    assert cells == [(delay, horizon) for delay in (0, 4, 8) for horizon in (0, 2, 5)]
+    assert set(late[:3]) <= set(read_conditions(CONDITIONS / "feeding.yaml").conditions)
+
+
+def test_the_conditions_of_the_presets_are_there() -> None:
+    file = read_conditions(CONDITIONS / "feeding.yaml")
+    assert {name: len(file.choose(names)) for name, names in file.presets.items()} == {
+        "paper": 12,
+        "smoke": 3,
+    }
+    assert set(file.presets) <= set(PRESETS)
+    assert read_conditions(CONDITIONS / "delay.yaml").presets == {}
+
+
+@pytest.mark.parametrize(
+    ("given", "spec"),
+    [
+        (condition(name="baseline", obs="baseline"), {"obs": "baseline"}),
+        (condition(name="current", obs="current"), {"obs": "current"}),
+        (
+            condition(name="a", horizon=3, error="uniform", delay=2),
+            {"horizon": 3, "corruption": Corruption("uniform", delay=2)},
+        ),
+        (condition(name="a", prediction="shuffled"), {"corruption": Corruption("model")}),
+        (
+            condition(
+                name="a",
+                obs="current",
+                face_dropout=0.1,
+                face_dropout_length=4,
+                detector_rate=10,
+                corruption_seed=7,
+            ),
+            {
+                "obs": "current",
+                "corruption": Corruption(
+                    face_dropout=0.1, face_dropout_length=4, detector_rate=10, seed=7
+                ),
+            },
+        ),
+    ],
+)
+def test_a_condition_is_what_its_policy_observes(
+    given: ConditionConfig, spec: dict[str, object]
+) -> None:
+    preset = ObservationSpec("current_pred", cameras=(), object_pose=True)
+    assert given.observation(preset) == replace(preset, **spec)  # type: ignore[arg-type]
+
+
+def test_the_default_expert_is_the_first_of_the_task() -> None:
+    assert condition(name="a").for_task(task_entry("FeedingEnv")).expert == "reactive"
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ("- {name: a, horizn: 3}", ["line 3", "horizn", "did you mean 'horizon'"]),
+        ("- {name: a, horizon: three}", ["line 3", "horizon must be a whole number", "'three'"]),
+        ("- {name: a, horizon: true}", ["line 3", "a whole number"]),
+        ("- {name: a, horizon: 6}", ["line 3", "horizon 6", "1 to 5"]),
+        ("- {name: a, error: unifrom}", ["line 3", "unifrom", "did you mean 'uniform'"]),
+        ("- {name: a, obs: curent}", ["line 3", "did you mean 'current'"]),
+        ("- {name: a, obs: current, error: uniform}", ["line 3", "forecasts"]),
+        ("- {name: a, obs: baseline, delay: 2}", ["line 3", "baseline"]),
+        ("- {name: a, policy: Atc}", ["line 3", "did you mean 'Act'"]),
+        ("- {name: a, expert: quick}", ["line 3", "anticipatory, reactive"]),
+        ("- {name: a, prediction: frozen}", ["line 3", "persistence, shuffled, truth"]),
+        ("- {name: a, prediction: shuffled, error: uniform}", ["line 3", "without an error"]),
+        ("- {name: a, prediction: shuffled, obs: current}", ["line 3", "current_pred"]),
+        ("- {obs: current}", ["line 3", "no name"]),
+        ("- {name: a b}", ["line 3", "'a b'", "letters"]),
+        ("- {name: ../a}", ["line 3", "letters"]),
+        ("- current", ["line 3", "mapping"]),
+        ("- {name: a}\n  - {name: b}\n  - {name: a}", ["line 5", "'a' is there twice"]),
+        ("- {name: current, obs: current_pred}", ["line 3", "'current'", "of the paper"]),
+        (
+            "- {name: current_pred_h2, expert: anticipatory}",
+            ["line 3", "of the paper", "another name"],
+        ),
+        ("[]", ["no conditions"]),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_with_its_number(
+    lines: str, words: list[str], tmp_path: Path
+) -> None:
+    with pytest.raises(RequestError) as refused:
+        read_conditions(write(tmp_path, f"env: FeedingEnv\nconditions:\n  {lines}\n"))
+    message = str(refused.value)
+    assert "mine.yaml" in message
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("conditions: 3", "a list 'conditions:'"),
+        ("- {name: a}", "a list 'conditions:'"),
+        ("conditions: [{name: a}", "no YAML"),
+        ("env: FedingEnv\nconditions: [{name: a}]", "did you mean 'FeedingEnv'"),
+        ("envs: FeedingEnv\nconditions: [{name: a}]", "did you mean 'env'"),
+        ("presets: {smoke: [b]}\nconditions: [{name: a}]", "unknown condition 'b'"),
+        ("presets: {smoke: b}\nconditions: [{name: a}]", "'published', or a list"),
+        ("presets: [b]\nconditions: [{name: a}]", "'published', or a list"),
+        ("presets: {paper: published}\nconditions: [{name: a}]", "unknown condition 'baseline'"),
+    ],
+)
+def test_a_file_of_another_shape_is_refused(text: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match=r"mine\.yaml") as refused:
+        read_conditions(write(tmp_path, text))
+    assert words in str(refused.value)
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match=r"none\.yaml"):
+        read_conditions(tmp_path / "none.yaml")
+
+
+def test_conditions_are_chosen_in_the_order_of_the_file() -> None:
+    file = read_conditions(CONDITIONS / "feeding.yaml")
+    chosen = file.choose(["current_pred_h2", "baseline"])
+    assert [c.name for c in chosen] == ["baseline", "current_pred_h2"]
+    with pytest.raises(RequestError, match="did you mean 'current_pred_h1'"):
+        file.choose(["current_pred_h11"])
+
+
+def test_a_file_of_an_earlier_release_is_read_with_a_note(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    file = read_conditions(
+        write(tmp_path, "env: FeedingEnv\narms: [{name: a}, {name: b, delay: 3}]")
+    )
+    assert [c.name for c in file.conditions] == ["a", "b"]
+    assert "'arms:' is called 'conditions:' now" in caplog.text

@@ -1,0 +1,73 @@
+"""``render_mode="human"`` opens MuJoCo's viewer; here a stand-in for it, without a display."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import pytest
+
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
+from robo_manip_baselines.runs.errors import RequestError
+
+
+class FakeViewer:
+    """Records the times at which it was synchronised."""
+
+    def __init__(self, data: mujoco.MjData) -> None:
+        self.data, self.times, self.is_closed = data, [], False
+
+    def sync(self) -> None:
+        assert not self.is_closed
+        self.times.append(round(self.data.time, 6))
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[FakeViewer]:
+    """Viewers that were opened."""
+    viewers: list[FakeViewer] = []
+
+    def launch_passive(model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> FakeViewer:
+        assert isinstance(model, mujoco.MjModel)
+        viewers.append(FakeViewer(data))
+        return viewers[-1]
+
+    fake = SimpleNamespace(launch_passive=launch_passive)
+    monkeypatch.setattr(mujoco, "viewer", fake, raising=False)
+    return viewers
+
+
+def test_one_viewer_shows_every_step_until_it_is_closed(opened: list[FakeViewer]) -> None:
+    env = make_env("FeedingEnv", cameras=(), render_mode="human")
+    assert opened == []  # no window before the first episode
+    env.reset(seed=0)
+    (viewer,) = opened
+    assert viewer.data is world_of(env).data
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    assert env.render() is None
+    assert sorted(set(viewer.times)) == pytest.approx([0.0, 0.02, 0.04, 0.06])
+    env.reset(seed=1)
+    assert viewer.times[-1] == 0.0
+    assert len(opened) == 1
+    env.close()
+    assert viewer.is_closed
+
+
+def test_no_viewer_without_being_asked_for(opened: list[FakeViewer]) -> None:
+    env = make_env("FeedingEnv", cameras=())
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+    assert opened == []
+
+
+def test_an_unknown_mode_is_refused() -> None:
+    with pytest.raises(RequestError, match=r"unknown render mode 'humane' .*did you mean 'human'"):
+        FeedingEnv(cameras=(), render_mode="humane")
