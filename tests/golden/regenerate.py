@@ -212,10 +212,7 @@ def face_step(name: str) -> dict[str, Any]:
 
 def main() -> None:
     """Write every golden file."""
-    with atomic_file(FACE_STEP) as path:
-        path.write_text(
-            json.dumps({name: face_step(name) for name in FACE_SETTINGS}, indent=2) + "\n"
-        )
+    write_json(FACE_STEP, {name: face_step(name) for name in FACE_SETTINGS})
     golden = {
         "default": act_step(paper_compat=False),
         "paper_compat": act_step(paper_compat=True),
