@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import (HOME_QPOS)
-from robo_manip_baselines.observation.spec import ARM_JOINTS
+from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
 from robo_manip_baselines.envs.mujoco.face.motion import SEGMENT_DURATION, MotionLibrary
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET, PARKED_QPOS
+from robo_manip_baselines.observation.spec import ARM_JOINTS
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA, WIDTH, HEIGHT = "front_close", 640, 480

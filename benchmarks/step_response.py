@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import add_cube, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import (FINGER_CLOSED, FINGER_OPEN, HOME_QPOS)
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError

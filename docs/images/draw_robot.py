@@ -11,7 +11,8 @@ import numpy as np
 from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
 from robo_manip_baselines.envs.mujoco.cell.scene import add_cube, build_cell, look_at
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, HOME_QPOS
-from robo_manip_baselines.observation import ARM_JOINTS, CAMERAS
+from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.runs.command import run_command
 
 FOLDER = Path(__file__).parent

@@ -1,138 +1,142 @@
-"""The options of ``bin/Rollout.py``, for both of its uses."""
+"""``bin/Rollout.py``: record demonstrations of a scripted expert, or evaluate a trained policy."""
 
 from __future__ import annotations
 
+import argparse
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from robo_manip_baselines.data import list_episodes
-from robo_manip_baselines.data.episode import DEFAULT_QUALITY
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
-from robo_manip_baselines.observation import CAMERAS
-from robo_manip_baselines.observation.spec import CorruptionOptions, parse_cameras, parse_image_size
-from robo_manip_baselines.rollout.demonstrate import Collection, Summary, collect
-from robo_manip_baselines.rollout.videos import write_preview
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import Corruption, ObservationSpec
+from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.progress import closing_table
+
+if TYPE_CHECKING:
+    from robo_manip_baselines.policy.checkpoint import Checkpoint
+    from robo_manip_baselines.rollout.demonstrate import Collection
+    from robo_manip_baselines.rollout.evaluation import EvaluationConfig
 
 EXAMPLE = """python bin/Rollout.py FeedingEnv --scripted --num_episodes 50 --workers 2
 
 Example: python bin/Rollout.py FeedingEnv --policy Act --checkpoint runs/act --video 4"""
 
+DESCRIPTION = (
+    "Let a scripted expert record demonstrations (--scripted), or evaluate a trained policy "
+    "(--policy, --checkpoint)."
+)
+
+UNTRAINED = ObservationSpec("current_pred")
+"""Defaults of the observation where no checkpoint gives them."""
+
+PREVIEW = "preview.mp4"
+
+RECORDED = ("cameras", "image_size", "arms")
+"""Parts of the observation that demonstrations hold; they hold the truth behind the others."""
+
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class ScriptedOptions:
-    """Only with --scripted."""
+    """Only with --scripted.
 
-    expert: str = "reactive"
-    """reactive: Algorithm 1 of the paper. anticipatory: aims where the mouth will be."""
+    Attributes:
+        expert: Name of the scripted expert; the first one of the task if not given.
+        image_codec: jpeg, png or raw.
+        image_quality: Quality of jpeg, 1 to 100.
+        preview: Number of the first episodes that the preview video shows; 0 for no video.
+    """
+
+    expert: str | None = None
     image_codec: str = "jpeg"
-    """jpeg, png or raw."""
-    image_quality: int = DEFAULT_QUALITY
-    """Quality of jpeg, 1 to 100."""
+    image_quality: int = 90
     preview: int = 2
-    """How many of the first episodes the preview video shows; 0 for no video."""
 
 
 @dataclass(frozen=True)
 class PolicyOptions:
-    """Only with --policy."""
+    """Only with --policy.
+
+    Attributes:
+        checkpoint: Folder of a training run, or of one of its checkpoints.
+        num_envs: Episodes that run at once; results do not depend on it.
+        temporal_ensemble: Average the predictions of all chunks, whatever the checkpoint says.
+        n_action_steps: Execute so many actions of a chunk before the next, whatever the checkpoint
+            says.
+        device: Device of the network: auto, cpu, cuda or cuda:1.
+        precision: fp32, or bf16 for the products inside the network.
+        video: Videos to write: of the first successes and the first failures, half of each.
+        change_corruption: Let --error, --delay, --face_dropout, --detector_rate and their settings
+            replace those of the training; otherwise they are only checked.
+    """
 
     checkpoint: Path | None = None
-    """Folder of a training run, or of one of its checkpoints."""
     num_envs: int = 8
-    """Episodes that run at once; what they come to does not depend on it."""
     temporal_ensemble: bool = False
-    """Average the predictions of all chunks, whatever the checkpoint says."""
-    execute: int | None = None
-    """Carry out so many actions of a chunk before the next, whatever the checkpoint says."""
+    n_action_steps: Annotated[int | None, tyro.conf.arg(aliases=["--execute"])] = None
     device: str = "auto"
-    """Where the network runs: auto, cpu, cuda or cuda:1."""
     precision: str = "fp32"
-    """fp32, or bf16 for the products inside the network."""
     video: int = 0
-    """Videos to write: of the first successes and the first failures, half of each."""
-    obs: str | None = None
-    """What the policy is shown: the checkpoint says it, this is only checked against it."""
-    horizon: int | None = None
-    """Frames that it looks ahead; only checked."""
-    object_pose: bool = False
-    """Whether it is shown where the cube is; only checked."""
     change_corruption: bool = False
-    """Let --error, --delay, --face_dropout, --detector_rate and what belongs to them replace what
-    the policy was trained with; otherwise they are only checked."""
 
 
 @dataclass(frozen=True)
 class RolloutOptions:
-    """Let a scripted expert record demonstrations (--scripted), or evaluate a trained policy
-    (--policy, --checkpoint).
+    """Options of the command.
+
+    Attributes:
+        env: Task, for example FeedingEnv.
+        scripted: Let the scripted expert act, and record its episodes.
+        policy: Let a trained policy act, for example Act, and record its results.
+        num_episodes: Episodes, one for each seed from --seed on.
+        seed: Seed of the first episode; if not given, 0 with --scripted and 1000 with --policy.
+        out: Folder to write to; if not given, dataset/<env> or results/<env>_<run>.
+        face_motion: Start of the face's motion: with the episode, or after_lift. If not given,
+            episode, or as in the demonstrations of the policy.
+        clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
+        motion_library: File of recorded face motion; if not given, the one that ships with the
+            package, or that of the demonstrations.
+        workers: Processes in which environments step; with --policy, 0 steps them in the main one.
+        spec: Observation. With --scripted, cameras and image_size are recorded; with --policy, the
+            observation is that of the checkpoint, and options are checked against it.
+        corruption: --no_corruption shows the truth, whatever the checkpoint and other options say.
+        demonstration: Only with --scripted.
+        evaluation: Only with --policy.
     """
 
     env: tyro.conf.Positional[str]
-    """Environment, for example FeedingEnv."""
     scripted: bool = False
-    """Let the scripted expert act, and write its episodes down."""
     policy: str | None = None
-    """Let a trained policy act, for example Act, and write down how well it does."""
     num_episodes: int = 50
-    """Episodes, one for each seed from --seed on."""
     seed: int | None = None
-    """Seed of the first episode; if not given, 0 with --scripted and 1000 with --policy."""
     out: Path | None = None
-    """Folder to write to; if not given, dataset/<env> or results/<env>_<run>."""
-    cameras: tuple[str, ...] | None = None
-    """Cameras to record, or none; all if not given. With --policy, only checked."""
-    image_size: str | None = None
-    """Height x width of images in pixels; 480x640 if not given. With --policy, only checked."""
     face_motion: str | None = None
-    """When the face starts to move: with the episode, or after_lift. If not given, episode, or as
-    in the demonstrations of the policy."""
     clips: tuple[str, ...] = ()
-    """Recorded clips to draw from; if not given, all, or those of the demonstrations."""
     motion_library: Path | None = None
-    """File of recorded face motion; if not given, the one that ships with the package, or that of
-    the demonstrations."""
     workers: int = 2
-    """Processes in which environments step; with --policy, 0 steps them in the main one."""
+    spec: tyro.conf.OmitArgPrefixes[ObservationSpec] = field(default_factory=lambda: UNTRAINED)
+    corruption: bool = True
     demonstration: tyro.conf.OmitArgPrefixes[ScriptedOptions] = field(
         default_factory=ScriptedOptions
     )
     evaluation: tyro.conf.OmitArgPrefixes[PolicyOptions] = field(default_factory=PolicyOptions)
-    detection: tyro.conf.OmitArgPrefixes[CorruptionOptions] = field(
-        default_factory=CorruptionOptions
-    )
-    """Only with --policy: what stands between the true and the shown mouth."""
-
-    def __post_init__(self) -> None:
-        if self.scripted and self.policy is not None:
-            raise RequestError("--scripted and --policy: one of them acts; leave the other out")
-        if not self.scripted and self.policy is None:
-            raise RequestError(
-                "nothing acts; say --scripted to let the scripted expert act, or "
-                "--policy Act --checkpoint runs/... to let a trained policy act"
-            )
-        unused = (self.evaluation, self.detection) if self.scripted else (self.demonstration,)
-        for options in unused:
-            if name := _first_difference(options):
-                wanted = "--policy" if self.scripted else "--scripted"
-                raise RequestError(f"--{name} goes with {wanted}; leave it out")
-        if self.num_episodes < 1:
-            raise RequestError(f"num_episodes {self.num_episodes}: must be 1 or more")
-        if self.seed is not None and self.seed < 0:
-            raise RequestError(f"seed {self.seed}: must be 0 or more")
 
     def seeds(self, first: int) -> range:
         """Return the seeds of the episodes; ``first`` where none was given."""
         start = first if self.seed is None else self.seed
         return range(start, start + self.num_episodes)
 
-    def motion_arguments(self) -> dict[str, object]:
-        """Return the arguments of the environment about the recorded motion that were given."""
+    @property
+    def motion_arguments(self) -> dict[str, Any]:
+        """Arguments of the environment about the recorded motion that were given."""
         given = {
             "face_motion": self.face_motion,
             "clips": self.clips,
@@ -141,55 +145,93 @@ class RolloutOptions:
         return {name: value for name, value in given.items() if value}
 
 
-def _first_difference(options: ScriptedOptions | PolicyOptions | CorruptionOptions) -> str | None:
-    """Name the first option that is not at its default, as it is spelt."""
-    defaults = type(options)()
-    for name in (item.name for item in fields(options)):
-        value = getattr(options, name)
-        if value != getattr(defaults, name):
-            return f"no_{name}" if value is False else name
-    return None
+def require_consistent(options: RolloutOptions) -> None:
+    """Make sure that one of the two uses is chosen, and that all options go with it.
+
+    Raises:
+        RequestError: naming what does not fit.
+    """
+    if options.scripted and options.policy is not None:
+        raise RequestError("--scripted and --policy: one of them acts; leave the other out")
+    if not options.scripted and options.policy is None:
+        raise RequestError(
+            "nothing acts; give --scripted to let the scripted expert act, or "
+            "--policy Act --checkpoint runs/... to let a trained policy act"
+        )
+    given = options.evaluation if options.scripted else options.demonstration
+    changed = _changed_options(given, type(given)())
+    if options.scripted:
+        changed += [n for n in _changed_options(options.spec, UNTRAINED) if n not in RECORDED]
+        changed += [] if options.corruption else ["no_corruption"]
+    if changed:
+        wanted = "--policy" if options.scripted else "--scripted"
+        raise RequestError(f"--{changed[0]} goes with {wanted}; leave it out")
+    if options.num_episodes < 1:
+        raise RequestError(f"num_episodes {options.num_episodes}: must be 1 or more")
+    if options.seed is not None and options.seed < 0:
+        raise RequestError(f"seed {options.seed}: must be 0 or more")
 
 
-__all__ = ["EXAMPLE", "RolloutOptions", "rollout", "to_collection"]
+def _changed_options(given: Any, default: Any) -> list[str]:
+    """Return the options, as they are written, in which two dataclasses differ."""
+    names: list[str] = []
+    for item in fields(given):
+        value, before = getattr(given, item.name), getattr(default, item.name)
+        if isinstance(value, Corruption):
+            parts = _changed_options(value, before)
+            names += ["corruption_seed" if name == "seed" else name for name in parts]
+        elif value != before:
+            names.append(f"no_{item.name}" if value is False else item.name)
+    return names
 
-logger = logging.getLogger(__name__)
 
-PREVIEW = "preview.mp4"
-
-FIRST_SEED = 0
-"""of demonstrations, if none is given."""
+# -- demonstrations -------------------------------------------------------------------------------
 
 
-def rollout(options: RolloutOptions) -> None:
-    """Let the scripted expert or the trained policy act, whichever the options name.
+def to_collection(options: RolloutOptions) -> Collection:
+    """Return the collection that the options of --scripted ask for.
+
+    Raises:
+        RequestError: a value is not valid.
+    """
+    from robo_manip_baselines.rollout.demonstrate import Collection
+
+    spec, demonstration = options.spec, options.demonstration
+    arms = {} if spec.arms == ObservationSpec().arms else {"arms": spec.arms}
+    return Collection(
+        env=options.env,
+        out=options.out or Path("dataset") / options.env,
+        expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
+        seeds=options.seeds(first=0),
+        env_kwargs={
+            "cameras": spec.cameras,
+            "image_size": spec.image_size,
+            **arms,
+            "face_motion": "episode",
+            **options.motion_arguments,
+        },
+        codec=demonstration.image_codec,
+        quality=demonstration.image_quality,
+        workers=options.workers,
+    )
+
+
+def record(options: RolloutOptions) -> None:
+    """Record demonstrations, write their preview, and print the closing table.
 
     Raises:
         RequestError: the request cannot be met.
     """
-    if options.policy is None:
-        demonstrate_all(options)
-        return
-    # Imported here: demonstrations need no PyTorch.
-    from robo_manip_baselines.training.requirements import prepare_pytorch
+    from robo_manip_baselines.data import list_episodes
+    from robo_manip_baselines.rollout.demonstrate import collect
+    from robo_manip_baselines.rollout.results import mean_and_sd
+    from robo_manip_baselines.rollout.videos import write_preview
 
-    prepare_pytorch()
-    from robo_manip_baselines.commands.evaluate import evaluate
-
-    evaluate(options)
-
-
-def demonstrate_all(options: RolloutOptions) -> None:
-    """Collect what the options ask for, then print a table and write the preview.
-
-    Raises:
-        RequestError: the request cannot be met.
-    """
     shown = options.demonstration.preview
     if shown < 0:
         raise RequestError(f"preview {shown}: must be 0 or more episodes")
     collection = to_collection(options)
-    if shown and not collection.env_kwargs["cameras"] and (problem := opengl_problem()):
+    if shown and not options.spec.cameras and (problem := opengl_problem()):
         logger.warning("no preview video: %s", problem)
         shown = 0
     summary = collect(collection)
@@ -197,48 +239,141 @@ def demonstrate_all(options: RolloutOptions) -> None:
     video = collection.out / PREVIEW if episodes else None
     if video:
         write_preview(video, episodes)
-    print(table(collection, summary, video))  # noqa: T201
-
-
-def to_collection(options: RolloutOptions) -> Collection:
-    """Turn what was typed into what to collect."""
-    return Collection(
-        env=options.env,
-        out=options.out or Path("dataset") / options.env,
-        expert=options.demonstration.expert,
-        seeds=options.seeds(FIRST_SEED),
-        env_kwargs={
-            "cameras": CAMERAS if options.cameras is None else parse_cameras(options.cameras),
-            "image_size": parse_image_size(options.image_size or "480x640"),
-            "face_motion": "episode",
-            **options.motion_arguments(),
-        },
-        codec=options.demonstration.image_codec,
-        quality=options.demonstration.image_quality,
-        workers=options.workers,
-    )
-
-
-def table(collection: Collection, summary: Summary, video: Path | None) -> str:
-    """Lay out the closing table."""
-    mean, spread = summary.completion_time_mean, summary.completion_time_sd
     rate = summary.steps_per_second
     rows = {
         "episodes": str(summary.episodes),
         "success": f"{summary.successes}/{summary.episodes}",
         "strict success": f"{summary.strict_successes}/{summary.episodes}",
-        "completion time": "-"
-        if mean is None
-        else f"{mean:.2f}" + (f" ± {spread:.2f} s" if spread is not None else " s"),
+        "completion time": mean_and_sd(summary.completion_time_mean, summary.completion_time_sd),
         "speed": "-" if rate is None else f"{rate:.0f} steps/s",
         "failed seeds": ", ".join(map(str, summary.failed_seeds)) or "-",
         "written to": str(collection.out),
         "preview": str(video or "-"),
     }
-    width = max(map(len, rows))
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+    print(closing_table(rows))  # noqa: T201
+
+
+# -- evaluation -----------------------------------------------------------------------------------
+
+
+def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> EvaluationConfig:
+    """Return the evaluation that the options of --policy ask for.
+
+    Args:
+        options: parsed with the spec of the checkpoint as defaults.
+        checkpoint: that they name.
+
+    Raises:
+        RequestError: a value is not valid, or differs from the checkpoint where it may not.
+    """
+    from robo_manip_baselines.policy.registry import policy_entry
+    from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
+
+    policy_entry(options.policy or "")
+    task_entry(options.env)
+    given = options.evaluation
+    if given.checkpoint is None or checkpoint is None:
+        raise RequestError(
+            "which checkpoint? give --checkpoint runs/..., as bin/Train.py prints it"
+        )
+    trained = checkpoint.spec
+    pairs: dict[str, tuple[object, object]] = {
+        "policy": (options.policy, checkpoint.policy),
+        "environment": (options.env, checkpoint.env),
+    }
+    for item in fields(trained):
+        if item.name != "corruption":
+            pairs[item.name] = getattr(options.spec, item.name), getattr(trained, item.name)
+    for name, (typed, value) in pairs.items():
+        if typed != value:
+            raise RequestError(
+                f"checkpoint '{checkpoint.folder}' was trained with {name} {_as_typed(value)}, not "
+                f"{_as_typed(typed)}; leave the option as trained, or train another policy"
+            )
+    corruption = (options.spec.corruption if options.corruption else Corruption()).pinned()
+    is_given = options.corruption and not corruption.is_same_as(trained.corruption)
+    if is_given and not given.change_corruption:
+        raise RequestError(
+            f"checkpoint '{checkpoint.folder}' was trained with {trained.corruption}, not with "
+            f"{corruption}; leave the options as trained, or give --change_corruption to evaluate "
+            "it under the other one"
+        )
+    return EvaluationConfig(
+        checkpoint=given.checkpoint,
+        seeds=options.seeds(FIRST_SEED),
+        out=options.out,
+        env_kwargs=options.motion_arguments,
+        corruption=None if corruption == trained.corruption else corruption,
+        temporal_ensemble=given.temporal_ensemble,
+        n_action_steps=given.n_action_steps,
+        num_envs=given.num_envs,
+        workers=options.workers,
+        device=given.device,
+        precision=given.precision,
+        videos=given.video,
+    )
+
+
+def evaluate_policy(options: RolloutOptions, checkpoint: Checkpoint | None) -> None:
+    """Evaluate a checkpoint and print the closing table.
+
+    Raises:
+        RequestError: the request cannot be met.
+    """
+    from robo_manip_baselines.rollout.evaluation import EvaluationPlan, run_plan
+    from robo_manip_baselines.rollout.results import summary_table
+
+    plan = EvaluationPlan.of(to_evaluation(options, checkpoint))
+    summary, videos = run_plan(plan)
+    names = ", ".join(str(path.relative_to(plan.out)) for path in videos)
+    facts = {"written to": str(plan.out), "videos": names or "-"}
+    print(summary_table(plan.env.task, summary, facts))  # noqa: T201
+
+
+def _as_typed(value: object) -> str:
+    if isinstance(value, tuple):
+        is_size = bool(value) and isinstance(value[0], int)
+        return ("x" if is_size else ",").join(map(str, value)) or "none"
+    return str(value)
+
+
+# -- command line ---------------------------------------------------------------------------------
+
+
+def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | None]:
+    """Read a command line; the spec of the checkpoint that it names gives the defaults.
+
+    Raises:
+        RequestError: one line that names what is wrong and what is valid.
+        SystemExit: with code 0 after ``--help``.
+    """
+    # What decides the defaults is looked up before the options are parsed.
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("policy", "checkpoint", "error", "error_stats"):
+        early.add_argument(f"--{name}", f"--{name.replace('_', '-')}", nargs="?")
+    found, _ = early.parse_known_args(list(args))
+    checkpoint, spec = None, UNTRAINED
+    if found.policy and found.checkpoint:
+        from robo_manip_baselines.policy.checkpoint import read_checkpoint
+
+        checkpoint = read_checkpoint(found.checkpoint)
+        corruption = checkpoint.spec.corruption
+        # The statistics of the training go with its error, and with no other file.
+        if (found.error or corruption.error) not in MEASURED_ERRORS:
+            corruption = replace(corruption, error_stats=None, stats_sha256=None)
+        elif found.error_stats:
+            corruption = replace(corruption, stats_sha256=None)
+        spec = replace(checkpoint.spec, corruption=corruption)
+    default = RolloutOptions(tyro.MISSING, spec=spec)
+    options = parse(RolloutOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)
+    require_consistent(options)
+    return options, checkpoint
 
 
 def main(args: Sequence[str]) -> None:
     """Run ``bin/Rollout.py``."""
-    rollout(parse(RolloutOptions, EXAMPLE, args=args))
+    options, checkpoint = parse_options(args)
+    if options.scripted:
+        record(options)
+    else:
+        evaluate_policy(options, checkpoint)

@@ -1,6 +1,7 @@
-"""The truth that an episode file holds, ready for `observe`.
+"""Demonstrations: a folder of episodes as a policy sees it, split into training and validation.
 
-Legend: T control steps, A arms (left before right), K = 6 frames from now to the longest horizon.
+Legend: E episodes, T control steps of an episode, A arms (left before right) or elements of an
+action, S elements of the packed observation.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.data.episode import EpisodeReader, read_metadata
 from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_episodes, seed_of
+from robo_manip_baselines.data.schema import POLICY_ATTRIBUTES
 from robo_manip_baselines.observation import ObservationSpec, State
 from robo_manip_baselines.observation.corruption import NO_PREDICTION
 from robo_manip_baselines.runs.errors import RequestError
@@ -115,16 +117,6 @@ def split_episodes(seeds: Iterable[int], fraction: float, seed: int) -> Split:
     shuffled = np.random.default_rng([seed, *b"split"]).permutation(ordered).tolist()
     return Split(tuple(sorted(shuffled[held_out:])), tuple(sorted(shuffled[:held_out])))
 
-
-SHARED = (
-    "env_id",
-    "xml_hash",
-    "control_period",
-    "prediction_period",
-    "action_names",
-    "joint_names",
-)
-"""Attributes that episodes must share for one policy to learn from them."""
 
 _SHOWN = {field.name for field in fields(ObservationSpec)} | {"error"}
 """Arguments of an environment that say what it shows (``error``: in older files); files hold truth,
@@ -280,8 +272,8 @@ def _require_same(
     first: Path, expected: Mapping[str, Any], path: Path, given: Mapping[str, Any]
 ) -> None:
     """Raise RequestError if two files are not of one kind."""
-    ours = {**{name: expected[name] for name in SHARED}, "env_kwargs": _world(expected)}
-    theirs = {**{name: given[name] for name in SHARED}, "env_kwargs": _world(given)}
+    ours = {**{name: expected[name] for name in POLICY_ATTRIBUTES}, "env_kwargs": _world(expected)}
+    theirs = {**{name: given[name] for name in POLICY_ATTRIBUTES}, "env_kwargs": _world(given)}
     for name, value in ours.items():
         if theirs[name] != value:
             raise RequestError(

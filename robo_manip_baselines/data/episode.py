@@ -1,4 +1,7 @@
-"""Pictures to bytes and back: JPEG, PNG or raw. Images are RGB, (H, W, 3) uint8."""
+"""Episode files: one HDF5 file an episode, read lazily, written atomically.
+
+Images are RGB, (H, W, 3) uint8, and stored as JPEG, PNG or raw.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ DEFAULT_QUALITY = 90
 def encode_image(
     image: np.ndarray, codec: str = "jpeg", quality: int = DEFAULT_QUALITY
 ) -> np.ndarray:
-    """Encode one picture.
+    """Encode one image.
 
     Args:
         image: (H, W, 3) uint8, RGB.
@@ -86,21 +89,21 @@ def decode_image(data: np.ndarray) -> np.ndarray:
         (H, W, 3) uint8, RGB.
 
     Raises:
-        ValueError: if the bytes are no picture.
+        ValueError: the bytes are no image.
     """
     if data.ndim == 3:
         return data
     try:
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     except cv2.error as error:
-        raise ValueError(f"no picture: {str(error).strip()}") from error
+        raise ValueError(f"no image: {str(error).strip()}") from error
     if bgr is None:
-        raise ValueError("no picture")
+        raise ValueError("no image")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
 def image_checksum(data: np.ndarray) -> int:
-    """CRC-32 of an encoded picture, as kept beside it in the episode file."""
+    """CRC-32 of an encoded image, as kept beside it in the episode file."""
     return zlib.crc32(np.ascontiguousarray(data).reshape(-1).data)
 
 
@@ -201,7 +204,7 @@ class EpisodeReader:
             ) from error
 
     def encoded_frame(self, camera: str, step: int) -> np.ndarray:
-        """The bytes of one picture, (N,) uint8; with the codec ``raw`` the (H, W, 3) image.
+        """The bytes of one image, (N,) uint8; with the codec ``raw`` the (H, W, 3) image.
 
         Raises:
             RequestError: for a camera or step that the episode does not have.
@@ -220,7 +223,7 @@ class EpisodeReader:
             ) from error
 
     def frame(self, camera: str, step: int) -> np.ndarray:
-        """One picture, (H, W, 3) uint8 RGB. Raises as `encoded_frame` does."""
+        """One image, (H, W, 3) uint8 RGB. Raises as `encoded_frame` does."""
         data = self.encoded_frame(camera, step)
         try:
             return decode_image(data)
@@ -235,7 +238,7 @@ class EpisodeReader:
 
 
 class FrameStore:
-    """The encoded pictures of one camera in an open file.
+    """The encoded images of one camera in an open file.
 
     Raises:
         KeyError, ValueError, OSError: see `READ_ERRORS`; if something is missing or damaged.
@@ -253,7 +256,7 @@ class FrameStore:
             raise ValueError(f"{frames} frames instead of {num_steps}")
 
     def encoded(self, step: int) -> np.ndarray:
-        """One picture as it was given to the writer; raises if it is not that any more."""
+        """One image as it was given to the writer; raises if it is not that any more."""
         if self._offset is None:
             data = np.asarray(self._data[step])
         else:
@@ -324,7 +327,7 @@ def one_line(error: BaseException) -> str:
 # From this release of the file format on, HDF5 keeps checksums of its own structure.
 _HDF5_FORMAT = ("v110", "v110")
 
-# Of pictures one after another: about one JPEG of 480 x 640, so that one frame reads one or two.
+# Of images one after another: about one JPEG of 480 x 640, so that one frame reads one or two.
 _CHUNK_BYTES = 65536
 
 EncodedImages = Mapping[str, Sequence[np.ndarray]]

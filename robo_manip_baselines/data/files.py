@@ -13,7 +13,7 @@ _EPISODE_NAME = re.compile(r"episode_(\d{6,})\.hdf5")
 
 
 def episode_path(folder: str | Path, seed: int, success: bool) -> Path:
-    """Where the episode of a seed belongs: ``episode_000012.hdf5``, failures under ``failed/``."""
+    """Return the path of a seed's episode: ``episode_000012.hdf5``, failures under ``failed/``."""
     if seed < 0:
         raise RequestError(f"a seed is 0 or more, not {seed}")
     parent = Path(folder) if success else Path(folder) / FAILED_FOLDER

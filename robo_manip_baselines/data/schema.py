@@ -30,10 +30,20 @@ READABLE_VERSIONS = (1, 2, 3)
 """A file has the lowest version that describes it: 2 added ``predicted_mouth``, 3 other tasks than
 feeding, whose fields and attributes are those of the task that ``env_id`` names."""
 
-# A group for each camera: `data`, the pictures one after another; `offset` (T + 1,), where each
+# A group for each camera: `data`, the images one after another; `offset` (T + 1,), where each
 # begins; `checksum` (T,), the CRC-32 of each. HDF5's own type for rows of varying length is not
 # used: it has no checksum, and a changed byte in it can make the library loop for ever.
 IMAGE_GROUP = "images"
+
+POLICY_ATTRIBUTES = (
+    "env_id",
+    "xml_hash",
+    "control_period",
+    "prediction_period",
+    "action_names",
+    "joint_names",
+)
+"""Attributes that episodes must share for one policy to learn from them."""
 
 SYMBOLS: Mapping[str, str] = {
     "T": "control steps of the episode",
@@ -331,7 +341,7 @@ def content_digest(
 def episode_consistency(
     attributes: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> list[str]:
-    """What attributes and arrays say about one another."""
+    """Return contradictions between attributes and arrays."""
     problems: list[str] = []
     for name, field, axis in (
         ("joint_names", "joint_position", 1),

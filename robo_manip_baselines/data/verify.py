@@ -1,4 +1,4 @@
-"""Finding damage in a folder of episodes that should belong together."""
+"""Verification of episode files, and of a folder of episodes that should belong together."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from robo_manip_baselines.data.episode import (
 from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes, seed_of
 from robo_manip_baselines.data.schema import (
     IMAGE_GROUP,
+    POLICY_ATTRIBUTES,
     EpisodeSchema,
     content_digest,
     episode_consistency,
@@ -36,18 +37,8 @@ from robo_manip_baselines.data.schema import (
 )
 from robo_manip_baselines.runs.errors import RequestError
 
-# What a folder's episodes must share for one policy to learn from them.
-SHARED_ATTRIBUTES = (
-    "env_id",
-    "env_kwargs",
-    "xml_hash",
-    "cameras",
-    "image_size",
-    "control_period",
-    "prediction_period",
-    "action_names",
-    "joint_names",
-)
+SHARED_ATTRIBUTES = (*POLICY_ATTRIBUTES, "env_kwargs", "cameras", "image_size")
+"""Attributes that the episodes of a folder must share."""
 
 
 def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
@@ -67,7 +58,7 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
     if not paths:
         raise RequestError(f"'{folder}' holds no episode_*.hdf5 file")
     problems: list[Problem] = []
-    with ThreadPoolExecutor(max_workers=2) as pool:  # HDF5 is serial; decoding pictures is not
+    with ThreadPoolExecutor(max_workers=2) as pool:  # HDF5 is serial; decoding images is not
         found = pool.map(lambda path: verify_file(path, images=images), paths)
         for of_one_file in tqdm(found, total=len(paths), unit="file", disable=None):
             problems += of_one_file
@@ -79,7 +70,7 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """What can be read of a file's attributes; its damage has been reported already."""
+    """Return the attributes that can be read; damage has been reported already."""
     try:
         with open_hdf5(path) as file:
             return readable_attributes(file, _schema(file))[0]
@@ -154,7 +145,7 @@ def verify_file(path: str | Path, *, images: bool = True) -> list[Problem]:
 
     Args:
         path: the file.
-        images: read and decode every picture, too; without it only their number is checked.
+        images: read and decode every image, too; otherwise only their number is checked.
     """
     path = Path(path)
     try:

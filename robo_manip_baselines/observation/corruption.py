@@ -135,7 +135,7 @@ class Corruption:
         return replace(start, **changes)
 
     def __bool__(self) -> bool:
-        """Whether anything is corrupted."""
+        """Return whether anything is corrupted."""
         return bool(
             self.error != "none"
             or self.delay
@@ -186,7 +186,7 @@ class Corruption:
         return replace(self, stats_sha256=stats.sha256)
 
     def is_same_as(self, other: Corruption) -> bool:
-        """Whether both corrupt alike; statistics count by their digest, not by their path."""
+        """Return whether both corrupt alike; statistics count by digest, not by path."""
         if not (self or other):
             return True
         return replace(self, error_stats=None) == replace(other, error_stats=None)

@@ -80,7 +80,7 @@ class ObservedNames:
 
 @dataclass(frozen=True)
 class ObservationSpec:
-    """What a policy is shown.
+    """Declaration of what a policy is shown.
 
     Attributes:
         obs: Preset: baseline (robot and cameras), current (also the mouth and its distance to the

@@ -1,4 +1,4 @@
-"""One demonstration: a scripted expert acts in an environment, and everything is written down."""
+"""Demonstrations: a scripted expert acts in an environment, and every step is recorded."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import logging
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -33,13 +33,16 @@ from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import atomic_file, prepare_folder
+from robo_manip_baselines.runs.files import prepare_folder, write_json
 from robo_manip_baselines.runs.versions import software_versions
 
+SUMMARY = "summary.json"
 
-@dataclass(frozen=True)
-class Demonstration:
-    """What one episode leaves behind, as ``data.write_episode`` takes it.
+logger = logging.getLogger(__name__)
+
+
+class Demonstration(NamedTuple):
+    """Content of one episode file, as `write_episode` takes it.
 
     Attributes:
         arrays: field -> (T, ...) array.
@@ -58,10 +61,10 @@ def demonstrate(
     """Let an expert act through one episode.
 
     Args:
-        env: made by ``make_env``; its cameras are recorded.
-        expert: a name of ``EXPERTS``.
+        env: made by `make_env`; its cameras are recorded.
+        expert: name in the task's entry.
         seed: of the episode.
-        codec: see ``data.encode_image``.
+        codec: see `encode_image`.
         quality: of JPEG, 1 to 100.
     """
     if env.spec is None:
@@ -69,9 +72,8 @@ def demonstrate(
     world = world_of(env)
     actor = world.task.make_expert(expert, world)
     rows: dict[str, list[Any]] = defaultdict(list)
-    images: dict[str, list[NDArray[np.uint8]]] = {
-        camera: [] for camera in world.observation_spec.cameras
-    }
+    cameras = world.observation_spec.image_keys()
+    images: dict[str, list[NDArray[np.uint8]]] = {camera: [] for camera in cameras.values()}
     observation, info = env.reset(seed=seed)
     start = world.start_attributes()
     actor.reset()
@@ -81,20 +83,20 @@ def demonstrate(
         for name, value in world.episode_row().items():
             rows[name].append(value)
         rows["action"].append(action)
-        for key, camera in world.observation_spec.image_keys().items():
+        for key, camera in cameras.items():
             images[camera].append(encode_image(observation[key], codec, quality))
         observation, _, terminated, truncated, info = env.step(action)
         rows["is_success"].append(info["is_success"])
         rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated
-    time = info["completion_time"]
+    completion_time = info["completion_time"]
     attributes = {
         "env_id": env.spec.id,
         "env_kwargs": dict(env.spec.kwargs),
         **start,
         "is_success": info["is_success"],
         "is_success_strict": info["is_success_strict"],
-        "completion_time": np.nan if time is None else time,
+        "completion_time": np.nan if completion_time is None else completion_time,
         "versions": software_versions("mujoco", "numpy", "robo_manip_baselines"),
         "seed": seed,
         "expert": expert,
@@ -105,23 +107,21 @@ def demonstrate(
     return Demonstration(arrays, images, attributes)
 
 
-SUMMARY = "summary.json"
-
-logger = logging.getLogger(__name__)
-
-
 @dataclass(frozen=True)
 class Collection:
-    """What to collect, and how.
+    """Demonstrations to collect.
 
     Attributes:
-        env: name of the environment.
+        env: name of the task.
         out: folder of the demonstrations; failed episodes go to its ``failed/``.
-        expert: a name of ``EXPERTS``.
+        expert: name in the task's entry.
         seeds: of the episodes, one each.
-        env_kwargs: arguments of the environment.
+        env_kwargs: arguments of the environment; held as JSON holds them.
         codec, quality: of the images.
         workers: processes.
+
+    Raises:
+        RequestError: a value is not valid.
     """
 
     env: str
@@ -134,6 +134,7 @@ class Collection:
     workers: int = 1
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
         require_choice("expert", self.expert, task_entry(self.env).experts)
         require_choice("image codec", self.codec, CODECS)
         if self.seeds.start < 0:
@@ -146,18 +147,28 @@ class Collection:
         if not 1 <= self.quality <= 100:
             raise RequestError(f"image quality {self.quality}: must be 1 to 100")
 
+    def to_json(self) -> dict[str, Any]:
+        """Return what JSON can hold."""
+        return {**asdict(self), "out": str(self.out), "seeds": [self.seeds.start, self.seeds.stop]}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Collection:
+        """Return the collection that ``to_json`` was called on.
+
+        Raises:
+            RequestError: a value is not valid.
+        """
+        return cls(**{**values, "out": Path(values["out"]), "seeds": range(*values["seeds"])})
+
     def path(self, seed: int) -> Path | None:
         """Return the file of a finished seed, wherever it is; None if there is none."""
-        for success in (True, False):
-            path = episode_path(self.out, seed, success)
-            if path.is_file():
-                return path
-        return None
+        paths = (episode_path(self.out, seed, success) for success in (True, False))
+        return next((path for path in paths if path.is_file()), None)
 
 
 @dataclass(frozen=True)
-class Summary:
-    """How a collection went.
+class CollectionSummary:
+    """Summary of a collection.
 
     Attributes:
         episodes: how many there are.
@@ -178,7 +189,7 @@ class Summary:
     steps_per_second: float | None
 
 
-def collect(collection: Collection) -> Summary:
+def collect(collection: Collection) -> CollectionSummary:
     """Record every seed that has not been recorded yet, and write ``summary.json``.
 
     Killed at any moment, it leaves whole episodes only; the same call carries on from there.
@@ -188,8 +199,8 @@ def collect(collection: Collection) -> Summary:
     """
     # Everything about the request that can be wrong is found out here, before any file exists.
     with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
-        env.reset(seed=collection.seeds.start)
-        _refuse_other_settings(collection, env)
+        _require_fitting_expert(collection, env)
+        _refuse_other_settings(collection, world_of(env).xml_hash)
         prepare_folder(collection.out)
         remove_partial_episodes(collection.out)
         done = finished_seeds(collection.out)
@@ -206,18 +217,28 @@ def collect(collection: Collection) -> Summary:
                 steps += count
                 progress.update()
         elapsed = time.perf_counter() - begin
-    summary = summarise(collection, steps, steps / elapsed if todo else None)
-    _write_summary(collection, summary)
+    summary = _summarize(collection, steps, steps / elapsed if todo else None)
+    content = {
+        "env": task_entry(collection.env).env_id,
+        "env_kwargs": collection.env_kwargs,
+        "expert": collection.expert,
+        "first_seed": collection.seeds.start,
+        "workers": collection.workers,
+        **asdict(summary),
+    }
+    write_json(collection.out / SUMMARY, content)
     return summary
 
 
-def summarise(collection: Collection, steps: int, steps_per_second: float | None) -> Summary:
-    """Sum up what the files of a collection say."""
+def _summarize(
+    collection: Collection, steps: int, steps_per_second: float | None
+) -> CollectionSummary:
+    """Summarize the files of a collection."""
     outcomes = {
         seed: read_metadata(path) for seed in collection.seeds if (path := collection.path(seed))
     }
     times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
-    return Summary(
+    return CollectionSummary(
         episodes=len(outcomes),
         successes=len(times),
         strict_successes=sum(bool(o["is_success_strict"]) for o in outcomes.values()),
@@ -254,7 +275,7 @@ def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> 
         env, collection.expert, seed, codec=collection.codec, quality=collection.quality
     )
     path = episode_path(collection.out, seed, demonstration.attributes["is_success"])
-    write_episode(path, demonstration.arrays, demonstration.images, demonstration.attributes)
+    write_episode(path, *demonstration)
     return len(demonstration.arrays["time"])
 
 
@@ -274,7 +295,26 @@ def _record_in_worker(seed: int) -> int:
     return _record(_worker["collection"], _worker["env"], seed)
 
 
-def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:
+def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:
+    """Refuse an expert that does not move the arms of the environment.
+
+    Raises:
+        RequestError: its actions have another size.
+    """
+    world = world_of(env)
+    env.reset(seed=collection.seeds.start)
+    actor = world.task.make_expert(collection.expert, world)
+    actor.reset()
+    action = actor.act()
+    if action.shape != env.action_space.shape:
+        raise RequestError(
+            f"arms {world.observation_spec.arms}: the expert '{collection.expert}' gives actions "
+            f"of shape {action.shape}, {collection.env} takes {env.action_space.shape}; choose "
+            "other arms"
+        )
+
+
+def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     """Refuse to mix episodes of other settings with those that the folder holds.
 
     Raises:
@@ -289,12 +329,11 @@ def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any])
     there = read_metadata(present)
     wanted = {
         "env_id": task_entry(collection.env).env_id,
-        # As JSON would give them back: tuples become lists.
-        "env_kwargs": json.loads(json.dumps(collection.env_kwargs)),
+        "env_kwargs": collection.env_kwargs,
         "expert": collection.expert,
         "image_codec": collection.codec,
         "image_quality": collection.quality,
-        "xml_hash": world_of(env).xml_hash,
+        "xml_hash": xml_hash,
     }
     for name, value in wanted.items():
         if there[name] != value:
@@ -302,16 +341,3 @@ def _refuse_other_settings(collection: Collection, env: gymnasium.Env[Any, Any])
                 f"'{collection.out}' holds episodes with {name} {there[name]}, not {value}; "
                 "give another --out or remove that folder"
             )
-
-
-def _write_summary(collection: Collection, summary: Summary) -> None:
-    content = {
-        "env": task_entry(collection.env).env_id,
-        "env_kwargs": collection.env_kwargs,
-        "expert": collection.expert,
-        "first_seed": collection.seeds.start,
-        "workers": collection.workers,
-        **asdict(summary),
-    }
-    with atomic_file(collection.out / SUMMARY) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

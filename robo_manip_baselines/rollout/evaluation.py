@@ -1,282 +1,361 @@
-"""Experimental arms: what a policy was trained with, what it is shown, and what that is called."""
+"""Evaluation of a trained policy: configuration, checks, episodes, results and videos."""
 
 from __future__ import annotations
 
-import platform
-from contextlib import closing
-from dataclasses import asdict, dataclass, fields, replace
-from importlib.metadata import version
+import contextlib
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robo_manip_baselines.commands.rollout import PolicyOptions, RolloutOptions
+from tqdm import tqdm
+
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
-from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, world_of
-from robo_manip_baselines.envs.mujoco.tasks.registry import env_id
-from robo_manip_baselines.observation import Corruption, ObservationSpec
-from robo_manip_baselines.observation.spec import CorruptionOptions, parse_cameras, parse_image_size
-from robo_manip_baselines.policy.checkpoint import Checkpoint, read_checkpoint
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.observation import Corruption
+from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model, read_checkpoint
 from robo_manip_baselines.policy.presets import Acting
-from robo_manip_baselines.policy.registry import policy_entry
-from robo_manip_baselines.rollout.results import EpisodeResult
-from robo_manip_baselines.rollout.workers import Task
+from robo_manip_baselines.rollout.results import (
+    SUMMARY,
+    EpisodeResult,
+    EvaluationSummary,
+    ResultsFile,
+    summarize,
+)
+from robo_manip_baselines.rollout.rollout import ActingPolicy, Recording, rollout
+from robo_manip_baselines.rollout.videos import pick_for_video, video_name, write_video
+from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import write_json
+from robo_manip_baselines.runs.versions import software_versions
+from robo_manip_baselines.training.requirements import prepare_pytorch
 
 if TYPE_CHECKING:
     import torch
 
-
-def arm_name(spec: ObservationSpec) -> str:
-    """Name an experimental arm: what a policy is shown, such as ``current_pred_h2_uniform``."""
-    horizon = f"_h{spec.horizon}" if spec.obs == "current_pred" else ""
-    corruption = f"_{spec.corruption.label}" if spec.corruption else ""
-    return f"{spec.obs}{horizon}{corruption}"
-
-
-def changed_name(trained: ObservationSpec, shown: ObservationSpec) -> str:
-    """Name what a policy is shown otherwise than in training: ``_under_delay3``; or nothing."""
-    if _without_path(trained.corruption) == _without_path(shown.corruption):
-        return ""
-    return f"_under_{shown.corruption.label if shown.corruption else 'truth'}"
-
-
-def describe(corruption: Corruption | None) -> str:
-    """Say what stands between truth and policy, as options are spelt."""
-    if corruption is None:
-        return "no corruption"
-    changed = {
-        item.name: getattr(corruption, item.name)
-        for item in fields(Corruption)
-        if getattr(corruption, item.name) != item.default
-    }
-    return ", ".join(
-        f"{name} {value[:12] if name == 'stats_sha256' else value}"
-        for name, value in changed.items()
-    )
-
-
-def choose_corruption(
-    checkpoint: Checkpoint, given: CorruptionOptions, is_change: bool
-) -> Corruption | None:
-    """Return what stands between truth and policy: as in training, or as was typed.
-
-    Args:
-        checkpoint: says what it was in training.
-        given: what was typed; ``--no_corruption`` always holds.
-        is_change: whether what was typed may differ from training.
-
-    Raises:
-        RequestError: it differs and may not, or cannot be used.
-    """
-    trained = checkpoint.spec.corruption
-    chosen = given.apply(trained)
-    chosen = chosen and chosen.pinned()
-    # Statistics are the same wherever their file lies: their digest is compared.
-    is_same = _without_path(chosen) == _without_path(trained)
-    if is_same or not given.corruption or is_change:
-        return chosen
-    raise RequestError(
-        f"checkpoint '{checkpoint.folder}' was trained with {describe(trained)}, not with "
-        f"{describe(chosen)}; leave the options as trained, or say --change_corruption to "
-        "evaluate it so all the same"
-    )
-
-
-def _without_path(corruption: Corruption | None) -> Corruption | None:
-    return corruption and replace(corruption, error_stats=None)
-
+logger = logging.getLogger(__name__)
 
 FIRST_SEED = 1000
-"""of an evaluation, if none is given: far from the seeds of demonstrations, which start at 0."""
+"""Default first seed of an evaluation, far from those of demonstrations, which start at 0."""
+
+VIDEOS = "videos"
+
+OnEpisode = Callable[[EpisodeResult, Recording], None]
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """What to evaluate, and how.
+class EvaluationConfig:
+    """Evaluation of a checkpoint.
 
     Attributes:
-        checkpoint: of the policy.
-        task: where it acts.
-        acting: how its chunks become actions.
-        seeds: of the episodes.
-        out: folder of the results.
-        num_envs, workers: see ``open_environments``.
-        device: where the network runs.
-        precision: of the network, see ``ChunkPolicy``.
+        checkpoint: folder of a training run, or of one of its checkpoints.
+        seeds: of the episodes, one each.
+        out: folder of the results; ``results/<task>_<run>`` if None.
+        env_kwargs: arguments of the environment that differ from those of the demonstrations; held
+            as JSON holds them.
+        corruption: of the observations, where it is not the one of the training; None otherwise.
+        temporal_ensemble: average the predictions of all chunks, whatever the checkpoint says.
+        n_action_steps: actions of a chunk to execute before the next one, where it is not the
+            number of the checkpoint; None otherwise.
+        num_envs: episodes that run at once; results do not depend on it.
+        workers: processes in which environments step; 0 steps them in this one.
+        device: of the network: auto, cpu, cuda or cuda:NUMBER.
+        precision: of the network: fp32, or bf16 for the products inside it.
+        videos: number of videos, half of them of successes.
+
+    Raises:
+        RequestError: a value is not valid.
     """
 
-    checkpoint: Checkpoint
-    task: Task
-    acting: Acting
+    checkpoint: Path
     seeds: range
+    out: Path | None = None
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    corruption: Corruption | None = None
+    temporal_ensemble: bool = False
+    n_action_steps: int | None = None
+    num_envs: int = 8
+    workers: int = 2
+    device: str = "auto"
+    precision: str = "fp32"
+    videos: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
+        if len(self.seeds) < 1:
+            count = self.seeds.stop - self.seeds.start
+            raise RequestError(f"num_episodes {count}: must be 1 or more")
+        for name, value, least in (
+            ("seed", self.seeds.start, 0),
+            ("num_envs", self.num_envs, 1),
+            ("workers", self.workers, 0),
+            ("video", self.videos, 0),
+        ):
+            if value < least:
+                raise RequestError(f"{name} {value}: must be {least} or more")
+        if self.temporal_ensemble and self.n_action_steps is not None:
+            raise RequestError("--temporal_ensemble and --n_action_steps: give one of them")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what JSON can hold."""
+        return {
+            **asdict(self),
+            "checkpoint": str(self.checkpoint),
+            "seeds": [self.seeds.start, self.seeds.stop],
+            "out": None if self.out is None else str(self.out),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> EvaluationConfig:
+        """Return the configuration that ``to_json`` was called on.
+
+        Raises:
+            RequestError: a value is not valid.
+        """
+        out, corruption = values.get("out"), values.get("corruption")
+        given: dict[str, Any] = {
+            **values,
+            "checkpoint": Path(values["checkpoint"]),
+            "seeds": range(*values["seeds"]),
+            "out": None if out is None else Path(out),
+            "corruption": None if corruption is None else Corruption.from_json(corruption),
+        }
+        return cls(**given)
+
+
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """An `EvaluationConfig` with its checkpoint read and everything checked.
+
+    Attributes:
+        config: the configuration.
+        checkpoint: of the policy.
+        env: environment in which the policy acts.
+        execution: of the policy's chunks of actions.
+        out: folder of the results.
+        device: of the network.
+    """
+
+    config: EvaluationConfig
+    checkpoint: Checkpoint
+    env: EnvConfig
+    execution: Acting
     out: Path
-    num_envs: int
-    workers: int
     device: torch.device
-    precision: str
+
+    @classmethod
+    def of(cls, config: EvaluationConfig) -> EvaluationPlan:
+        """Read the checkpoint and check that it, the environment and the machine fit.
+
+        Raises:
+            RequestError: something does not exist, or does not fit.
+        """
+        checkpoint = read_checkpoint(config.checkpoint)
+        prepare_pytorch()
+        # Imported here: a request that is wrong so far is refused without waiting for PyTorch.
+        from robo_manip_baselines.policy.execution import PRECISIONS
+        from robo_manip_baselines.training.device import choose_device
+
+        require_choice("precision", config.precision, PRECISIONS)
+        spec = checkpoint.spec
+        if config.corruption is not None:
+            spec = replace(spec, corruption=config.corruption.pinned())
+        recorded = checkpoint.dataset.get("env_kwargs", {})
+        env = EnvConfig(checkpoint.env, spec, {**recorded, **config.env_kwargs})
+        _require_fit(checkpoint, env)
+        if (spec.cameras or config.videos) and (problem := opengl_problem()):
+            why = "the policy sees images" if spec.cameras else "--video 0 needs no OpenGL"
+            raise RequestError(f"{problem} ({why})")
+        suffix = _corruption_suffix(checkpoint, env)
+        out = Path("results") / f"{checkpoint.env}_{run_name(config.checkpoint)}{suffix}"
+        return cls(
+            config=config,
+            checkpoint=checkpoint,
+            env=env,
+            execution=choose_execution(
+                checkpoint.acting, config.temporal_ensemble, config.n_action_steps
+            ),
+            out=config.out or out,
+            device=choose_device(config.device),
+        )
 
     def __str__(self) -> str:
-        acting, checkpoint = self.acting, self.checkpoint
+        execution, checkpoint, seeds = self.execution, self.checkpoint, self.config.seeds
         how = (
-            f"temporal ensemble (decay {acting.decay:g})"
-            if acting.temporal_ensemble
-            else f"{acting.execute} actions of each chunk"
+            f"temporal ensemble (decay {execution.decay:g})"
+            if execution.temporal_ensemble
+            else f"{execution.execute} actions of each chunk"
         )
         return (
-            f"{checkpoint.policy}, {self.arm}, step {checkpoint.step}, on "
-            f"{self.device} in {self.precision}: {how}; seeds {self.seeds[0]} to {self.seeds[-1]}"
+            f"{checkpoint.policy}, {self.condition}, step {checkpoint.step}, on "
+            f"{self.device} in {self.config.precision}: {how}; seeds {seeds[0]} to {seeds[-1]}"
         )
 
     @property
-    def arm(self) -> str:
-        """What the policy was trained with, and what it is shown here where that is another."""
-        trained = self.checkpoint.spec
-        return arm_name(trained) + changed_name(trained, self.task.spec)
+    def condition(self) -> str:
+        """Name of the experimental condition, such as ``current_pred_h2_under_delay3``."""
+        return self.checkpoint.spec.name + _corruption_suffix(self.checkpoint, self.env)
 
-    def seen_seeds(self) -> list[int]:
-        """Return the seeds that the demonstrations were recorded with, training or validation."""
-        split = self.checkpoint.split
-        return sorted(set(self.seeds) & {*split.train, *split.validation})
-
+    @property
     def settings(self) -> dict[str, Any]:
-        """Return what results of one folder must have in common."""
+        """What results of one folder must have in common."""
         return {
-            "env": env_id(self.task.env),
-            "env_kwargs": self.task.env_kwargs,
-            "observation": self.task.spec.to_json(),
+            "env": self.env.task.env_id,
+            "env_kwargs": self.env.env_kwargs,
+            "observation": self.env.spec.to_json(),
             "xml_hash": self.checkpoint.xml_hash,
             "policy": self.checkpoint.policy,
             "checkpoint": self.checkpoint.content_hash,
-            "acting": _effective(self.acting),
+            "acting": _effective(self.execution),
             "device": self.device.type,
-            "precision": self.precision,
+            "precision": self.config.precision,
         }
 
+    @property
     def facts(self) -> dict[str, Any]:
-        """Return what else to note beside results."""
+        """Further facts that are recorded beside results."""
         checkpoint = self.checkpoint
         return {
-            "arm": self.arm,
+            "condition": self.condition,
             "checkpoint_folder": str(checkpoint.folder),
             "checkpoint_step": checkpoint.step,
             "train_seed": checkpoint.train_seed,
-            "first_seed": self.seeds[0],
+            "first_seed": self.config.seeds[0],
         }
 
+    def make_policy(self, num_envs: int) -> ActingPolicy:
+        """Load the network and make it act in so many environments."""
+        from robo_manip_baselines.policy.execution import ChunkPolicy
 
-def plan(options: RolloutOptions) -> Evaluation:
-    """Turn what was typed into what to evaluate.
-
-    Raises:
-        RequestError: something does not exist, or checkpoint, environment and options do not fit.
-    """
-    given = options.evaluation
-    policy_entry(options.policy or "")
-    env_id(options.env)
-    for name, value, least in (
-        ("num_envs", given.num_envs, 1),
-        ("workers", options.workers, 0),
-        ("video", given.video, 0),
-    ):
-        if value < least:
-            raise RequestError(f"{name} {value}: must be {least} or more")
-    if given.checkpoint is None:
-        raise RequestError(
-            "which checkpoint? say --checkpoint runs/..., as bin/Train.py printed it"
+        checkpoint = self.checkpoint
+        return ChunkPolicy(
+            load_model(checkpoint, self.device),
+            checkpoint.spec,
+            checkpoint.normalization,
+            self.execution,
+            slots=num_envs,
+            device=self.device,
+            precision=self.config.precision,
         )
-    # Imported here: what was wrong above is said without waiting for PyTorch.
-    from robo_manip_baselines.policy.execution import PRECISIONS
-    from robo_manip_baselines.training.device import choose_device
 
-    require_choice("precision", given.precision, PRECISIONS)
-    checkpoint = read_checkpoint(given.checkpoint)
-    _refuse_contradictions(options, checkpoint)
-    recorded = checkpoint.dataset.get("env_kwargs", {})
-    corruption = choose_corruption(checkpoint, options.detection, given.change_corruption)
-    spec = replace(checkpoint.spec, corruption=corruption)
-    task = Task(checkpoint.env, spec, {**recorded, **options.motion_arguments()})
-    check_fit(checkpoint, task)
-    if (checkpoint.spec.cameras or given.video) and (problem := opengl_problem()):
-        why = "the policy sees images" if checkpoint.spec.cameras else "--video 0 needs no OpenGL"
-        raise RequestError(f"{problem} ({why})")
-    return Evaluation(
-        checkpoint=checkpoint,
-        task=task,
-        acting=choose_acting(checkpoint.acting, given),
-        seeds=options.seeds(FIRST_SEED),
-        out=options.out
-        or Path("results")
-        / f"{options.env}_{run_name(given.checkpoint)}{changed_name(checkpoint.spec, spec)}",
-        num_envs=given.num_envs,
-        workers=options.workers,
-        device=choose_device(given.device),
-        precision=given.precision,
-    )
-
-
-def choose_acting(trained: Acting, given: PolicyOptions) -> Acting:
-    """Return how to act: as the checkpoint says, or as was typed.
-
-    Raises:
-        RequestError: both ways were typed.
-    """
-    if given.temporal_ensemble and given.execute is not None:
-        raise RequestError("--temporal_ensemble and --execute: say one of them")
-    if given.execute is not None:
-        return replace(trained, temporal_ensemble=False, execute=given.execute)
-    return replace(trained, temporal_ensemble=True) if given.temporal_ensemble else trained
-
-
-def check_fit(checkpoint: Checkpoint, task: Task) -> None:
-    """Make sure that the environment is the one that the policy was trained for.
-
-    Raises:
-        RequestError: naming what the checkpoint has and what the environment has.
-    """
-    with closing(task.make()) as env:
-        world = world_of(env)
-        pairs = {
-            "actions": (", ".join(checkpoint.action_names), ", ".join(world.action_names)),
-            "control period": (checkpoint.control_period, CONTROL_PERIOD),
-            "size of the state": (checkpoint.sizes.state, task.vector_size),
-            "model hash": (checkpoint.xml_hash[:12], world.xml_hash[:12]),
+    def run(self, seeds: Sequence[int], on_episode: OnEpisode) -> None:
+        """Let the policy act through these seeds, with a progress bar."""
+        if not seeds:
+            return
+        checkpoint, successes = self.checkpoint, 0
+        num_envs = min(self.config.num_envs, len(seeds))
+        origin: dict[str, Any] = {
+            "policy": checkpoint.policy,
+            "condition": self.condition,
+            "observation": json.loads(json.dumps(self.env.spec.to_json())),
+            "train_seed": checkpoint.train_seed,
+            "checkpoint": checkpoint.content_hash,
+            "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),
         }
-    for name, (trained, here) in pairs.items():
-        if trained != here:
-            raise RequestError(
-                f"checkpoint '{checkpoint.folder}' was trained with {name} {trained}; {task.env} "
-                f"has {here} here; install the release that trained it, "
-                f"{checkpoint.versions.get('robo_manip_baselines', 'unknown')}, or train again"
-            )
+        with (
+            self._one_thread_if_small(),
+            open_envs(self.env, num_envs, self.config.workers) as envs,
+            tqdm(total=len(seeds), unit="episode", desc=checkpoint.policy) as progress,
+        ):
+
+            def finished(result: EpisodeResult, recording: Recording) -> None:
+                nonlocal successes
+                successes += result.is_success
+                on_episode(replace(result, **origin), recording)
+                progress.set_postfix_str(f"{successes} succeeded", refresh=False)
+                progress.update()
+
+            rollout(self.make_policy(num_envs), envs, seeds, on_episode=finished)
+
+    @contextlib.contextmanager
+    def _one_thread_if_small(self) -> Iterator[None]:
+        """Let PyTorch use one thread for a network without images on a CPU.
+
+        More of them would wait for one another on products this small, beside busy worker
+        processes, and cost several times what they save. One also rounds the same whatever the
+        number of cores.
+        """
+        import torch
+
+        before = torch.get_num_threads()
+        if self.device.type == "cpu" and not self.checkpoint.spec.cameras:
+            torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
 
 
-def _refuse_contradictions(options: RolloutOptions, checkpoint: Checkpoint) -> None:
-    """Refuse options that say otherwise than the checkpoint.
+def evaluate(config: EvaluationConfig) -> EvaluationSummary:
+    """Evaluate a checkpoint: run the episodes that its folder lacks, summarize, write videos.
 
     Raises:
-        RequestError: naming both.
+        RequestError: the request cannot be met.
     """
-    given, spec = options.evaluation, checkpoint.spec
-    cameras = None if options.cameras is None else parse_cameras(options.cameras)
-    pairs = {
-        "policy": (options.policy, checkpoint.policy),
-        "environment": (options.env, checkpoint.env),
-        "obs": (given.obs, spec.obs),
-        "horizon": (given.horizon, spec.horizon),
-        "object_pose": (given.object_pose or None, spec.object_pose),
-        "cameras": (cameras, spec.cameras),
-        "image_size": (
-            options.image_size and parse_image_size(options.image_size),
-            spec.image_size,
-        ),
-    }
-    for name, (typed, trained) in pairs.items():
-        if typed is not None and typed != trained:
-            raise RequestError(
-                f"checkpoint '{checkpoint.folder}' was trained with {name} {_spelt(trained)}, not "
-                f"{_spelt(typed)}; leave the option as trained, or train another policy"
-            )
+    return run_plan(EvaluationPlan.of(config))[0]
+
+
+def run_plan(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
+    """Run the episodes that the folder of an evaluation lacks; write summary and videos.
+
+    Returns:
+        The summary, and the files of all videos.
+
+    Raises:
+        RequestError: the folder holds other results, or the request cannot be met.
+    """
+    logger.info("%s", plan)
+    seeds, number, split = plan.config.seeds, plan.config.videos, plan.checkpoint.split
+    if known := sorted(set(seeds) & {*split.train, *split.validation}):
+        logger.warning(
+            "%d of the seeds are also seeds of the demonstrations (the first is %d); results on "
+            "them do not show how well the policy generalizes: choose another --seed",
+            len(known),
+            known[0],
+        )
+    recordings: dict[int, Recording] = {}
+    with ResultsFile(plan.out, plan.settings, plan.facts) as file:
+        todo = [seed for seed in seeds if seed not in file.done]
+        if len(todo) < len(seeds):
+            logger.info("%d of %d episodes are there already", len(seeds) - len(todo), len(seeds))
+
+        def on_episode(result: EpisodeResult, recording: Recording) -> None:
+            file.append(result)
+            recordings[result.seed] = recording
+            # Of each outcome, only the first few can be picked for a video.
+            there = [r for r in file.done.values() if r.is_success == result.is_success]
+            for late in sorted(r.seed for r in there)[number:]:
+                recordings.pop(late, None)
+
+        begin = time.perf_counter()
+        plan.run(todo, on_episode)
+        seconds = time.perf_counter() - begin
+        results = file.of(seeds)
+    summary = summarize(plan.env.task, results, new=len(todo), seconds=seconds)
+    write_json(plan.out / SUMMARY, {**plan.facts, **asdict(summary)})
+
+    videos = {plan.out / VIDEOS / video_name(r): r for r in pick_for_video(results, number)}
+    missing = {path: result for path, result in videos.items() if not path.exists()}
+    # Episodes of an earlier run, which was stopped before its videos, are run once more.
+    again = [result.seed for result in missing.values() if result.seed not in recordings]
+    plan.run(again, lambda result, recording: recordings.update({result.seed: recording}))
+    for path, result in missing.items():
+        write_video(path, plan.env, result, recordings[result.seed])
+    return summary, list(videos)
+
+
+def choose_execution(
+    trained: Acting, temporal_ensemble: bool, n_action_steps: int | None
+) -> Acting:
+    """Return the action execution of a checkpoint with the given changes."""
+    if n_action_steps is not None:
+        return replace(trained, temporal_ensemble=False, execute=n_action_steps)
+    return replace(trained, temporal_ensemble=True) if temporal_ensemble else trained
 
 
 def run_name(checkpoint: Path) -> str:
@@ -287,34 +366,39 @@ def run_name(checkpoint: Path) -> str:
     return path.name
 
 
-def stamp(result: EpisodeResult, evaluation: Evaluation) -> EpisodeResult:
-    """Note in a result which policy acted."""
-    checkpoint = evaluation.checkpoint
-    return replace(
-        result,
-        policy=checkpoint.policy,
-        arm=evaluation.arm,
-        train_seed=checkpoint.train_seed,
-        checkpoint=checkpoint.content_hash,
-        versions=software(),
-    )
+def _corruption_suffix(checkpoint: Checkpoint, env: EnvConfig) -> str:
+    """Name a corruption that is not the one of the training: ``_under_delay3``; else nothing."""
+    corruption = env.spec.corruption
+    if corruption.is_same_as(checkpoint.spec.corruption):
+        return ""
+    return f"_under_{corruption.label or 'truth'}"
 
 
-def software() -> dict[str, str]:
-    """Return the versions of what an outcome depends on."""
-    packages = ("mujoco", "numpy", "robo_manip_baselines", "torch")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+def _effective(execution: Acting) -> dict[str, Any]:
+    """Return the settings that make a difference, in the names of ``evaluation.json``."""
+    if execution.temporal_ensemble:
+        return {"temporal_ensemble": True, "decay": execution.decay}
+    return {"temporal_ensemble": False, "execute": execution.execute}
 
 
-def _effective(acting: Acting) -> dict[str, Any]:
-    """Return what of the settings makes a difference."""
-    used = "decay" if acting.temporal_ensemble else "execute"
-    return {name: asdict(acting)[name] for name in ("temporal_ensemble", used)}
+def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> None:
+    """Make sure that the environment is the one that the policy was trained for.
 
-
-def _spelt(value: object) -> str:
-    if isinstance(value, tuple):
-        parts = [str(part) for part in value]
-        is_size = bool(value) and isinstance(value[0], int)
-        return ("x" if is_size else ",").join(parts) or "none"
-    return str(value)
+    Raises:
+        RequestError: naming what the checkpoint has and what the environment has.
+    """
+    with contextlib.closing(config.make()) as env:
+        world = world_of(env)
+        pairs = {
+            "actions": (", ".join(checkpoint.action_names), ", ".join(world.action_names)),
+            "control period": (checkpoint.control_period, CONTROL_PERIOD),
+            "size of the state": (checkpoint.sizes.state, config.vector_size),
+            "model hash": (checkpoint.xml_hash[:12], world.xml_hash[:12]),
+        }
+    for name, (trained, here) in pairs.items():
+        if trained != here:
+            raise RequestError(
+                f"checkpoint '{checkpoint.folder}' was trained with {name} {trained}; {config.env} "
+                f"has {here} here; install the release that trained it, "
+                f"{checkpoint.versions.get('robo_manip_baselines', 'unknown')}, or train again"
+            )

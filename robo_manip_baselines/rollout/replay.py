@@ -1,4 +1,4 @@
-"""Acting out a recorded episode again, from its seed and its actions alone."""
+"""Replay of recorded episodes from their seed and their actions alone."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 
 from robo_manip_baselines.data import EpisodeReader
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
-from robo_manip_baselines.envs.mujoco.tasks.registry import NAMESPACE, make_env
+from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id, make_env
 from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far the simulator's state strays from the recorded one, at worst.
+    """Largest deviation of the simulator's state from the recorded one.
 
     Attributes:
         qpos: m, rad.
@@ -43,8 +43,8 @@ def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any
         RequestError: this release's environment is not the recorded one.
     """
     recorded = episode.attributes
-    name = recorded["env_id"].removeprefix(f"{NAMESPACE}/").rpartition("-v")[0]
-    env = make_env(name, **{**recorded["env_kwargs"], **changes})
+    task = entry_of_id(recorded["env_id"])
+    env = make_env(task.name, **{**recorded["env_kwargs"], **changes})
     xml_hash = world_of(env).xml_hash
     if xml_hash != recorded["xml_hash"]:
         env.close()
@@ -57,10 +57,10 @@ def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any
 
 
 def replay(env: gymnasium.Env[Any, Any], episode: EpisodeReader) -> Iterator[int]:
-    """Act an episode out; yield each step's index while the environment is as it was before it.
+    """Replay an episode; yield each step's index while the environment is as it was before it.
 
     Args:
-        env: from ``remake_env``.
+        env: from `remake_env`.
         episode: open file.
     """
     env.reset(seed=int(episode.attributes["seed"]))

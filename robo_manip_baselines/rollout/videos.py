@@ -1,4 +1,4 @@
-"""Videos of what happened: pictures side by side, tracks and captions drawn in, H.264 written.
+"""Videos of episodes: camera views side by side, tracks and captions drawn in, H.264.
 
 Images are RGB, (H, W, 3) uint8; drawing functions return a new image and leave theirs alone.
 """
@@ -20,18 +20,40 @@ from tqdm import tqdm
 from robo_manip_baselines.data import EpisodeReader, read_metadata
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, FaceEnv, world_of
-from robo_manip_baselines.observation import CAMERAS, ObservationSpec
+from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.rollout.replay import remake_env, replay
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
-from robo_manip_baselines.rollout.workers import Task, split_vector
+from robo_manip_baselines.rollout.workers import EnvConfig
 from robo_manip_baselines.runs.files import atomic_file
 
 Colour = tuple[int, int, int]
 
 YELLOW: Colour = (255, 214, 10)
+CYAN: Colour = (0, 229, 255)
 WHITE: Colour = (255, 255, 255)
 BLACK: Colour = (0, 0, 0)
+
+FRAME_STEPS = 2
+"""Control steps between two frames: 25 frames/s, half of what is simulated."""
+
+FPS = 1.0 / (FRAME_STEPS * CONTROL_PERIOD)
+
+TRACK_STEPS = 100
+"""Control steps of the target's past that are drawn: 2 s."""
+
+VIEW_SIZE = (360, 480)
+"""Height and width of each camera's view in pixels: three of them fit a screen."""
+
+LOOK = {"image_size": VIEW_SIZE, "shadows": True, "multisamples": 4}
+"""Arguments of an environment whose images are for people."""
+
+CLOSE_UP = "front_close"
+ZOOM = 3
+"""Magnification of the fourth view, of the surroundings of the target."""
+
+HOLD_SECONDS = 1.0
+"""for which the last frame, with the outcome, stays."""
 
 
 class VideoWriter:
@@ -154,7 +176,7 @@ def draw_track(
         A new image.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-    # Far outside the picture a line is cut off unseen; OpenCV's fixed-point numbers overflow.
+    # Far outside the image a line is cut off unseen; OpenCV's fixed-point numbers overflow.
     limit = 4 * max(image.shape)
     valid = np.isfinite(points).all(axis=1) & (np.abs(points) < limit).all(axis=1)
     fixed = np.round(np.where(valid[:, None], points, 0) * 16).astype(int)  # 1/16 pixel
@@ -221,18 +243,6 @@ def _add_line(
     np.maximum(region, line, out=region)
 
 
-FRAME_STEPS = 2
-"""Control steps between two frames: 25 frames/s, half of what is simulated."""
-
-TRACK_STEPS = 100
-"""Control steps of the mouth's past that are drawn: 2 s."""
-
-VIEW_SIZE = (360, 480)
-"""Height and width of each camera's view in pixels: three of them fit a screen."""
-
-MULTISAMPLES = 4
-
-
 def write_preview(path: Path, episodes: Sequence[Path]) -> None:
     """Write one H.264 video of some episodes, one after the other, with a progress bar.
 
@@ -246,7 +256,7 @@ def write_preview(path: Path, episodes: Sequence[Path]) -> None:
     steps = [int(read_metadata(episode)["num_steps"]) for episode in episodes]
     frames = sum(-(-count // FRAME_STEPS) for count in steps)
     with (
-        VideoWriter(path, 1.0 / (FRAME_STEPS * CONTROL_PERIOD)) as video,
+        VideoWriter(path, FPS) as video,
         tqdm(total=frames, unit="frame", desc=path.name) as progress,
     ):
         for episode in episodes:
@@ -256,45 +266,22 @@ def write_preview(path: Path, episodes: Sequence[Path]) -> None:
 
 
 def preview_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
-    """Act an episode out and draw it; yield (H, 3 W, 3) uint8 frames."""
+    """Replay an episode and draw it; yield (H, 3 W, 3) uint8 frames."""
     with (
         EpisodeReader(path) as episode,
-        closing(
-            remake_env(
-                episode,
-                cameras=(),
-                image_size=VIEW_SIZE,
-                shadows=True,
-                multisamples=MULTISAMPLES,
-            )
-        ) as env,
+        closing(remake_env(episode, cameras=(), **LOOK)) as env,
     ):
         world = world_of(env)
-        mouth = episode.array("mouth_position")[:, 0]
+        target = episode.array(world.task.target_field)[:, 0]
         names, phases = episode.attributes["phase_names"], episode.array("phase")
         title = f"seed {episode.attributes['seed']}, {episode.attributes['expert']}"
         for step in replay(env, episode):
-            if step % FRAME_STEPS:
-                continue
-            views = world.renderer.render(world.data, CAMERAS)
-            past = mouth[max(0, step - TRACK_STEPS) : step + 1]
-            drawn = [
-                draw_track(views[camera], project(world.model, world.data, camera, past, VIEW_SIZE))
-                for camera in CAMERAS
-            ]
-            seconds = step * CONTROL_PERIOD
-            drawn[0] = put_caption(drawn[0], f"{title}: {names[phases[step]]}, {seconds:.1f} s")
-            yield side_by_side(drawn)
-
-
-CYAN = (0, 229, 255)
-
-CLOSE_UP = "front_close"
-ZOOM = 3
-"""How much larger the fourth view shows the surroundings of the mouth."""
-
-HOLD_SECONDS = 1.0
-"""for which the last frame, with the outcome, stays."""
+            if step % FRAME_STEPS == 0:
+                views = world.renderer.render(world.data, CAMERAS)
+                past = target[max(0, step - TRACK_STEPS) : step + 1]
+                drawn = [draw_track(views[c], _pixels(world, c, past)) for c in CAMERAS]
+                caption = f"{title}: {names[phases[step]]}, {step * CONTROL_PERIOD:.1f} s"
+                yield side_by_side([put_caption(drawn[0], caption), *drawn[1:]])
 
 
 def pick_for_video(results: Sequence[EpisodeResult], number: int) -> list[EpisodeResult]:
@@ -312,106 +299,89 @@ def pick_for_video(results: Sequence[EpisodeResult], number: int) -> list[Episod
 
 
 def video_name(result: EpisodeResult) -> str:
-    """Name the video of an episode."""
+    """Return the file name of the video of an episode."""
     return f"seed_{result.seed:06d}_{result.failure or 'success'}.mp4"
 
 
-def write_video(path: Path, task: Task, result: EpisodeResult, recording: Recording) -> None:
+def write_video(path: Path, config: EnvConfig, result: EpisodeResult, recording: Recording) -> None:
     """Write an H.264 video of an episode.
+
+    Args:
+        path: of the video, ``....mp4``.
+        config: of the environment in which the policy acted.
+        result: of the episode.
+        recording: its observations and actions.
 
     Raises:
         RequestError: there is no OpenGL.
-        RuntimeError: the episode, acted out again, ends otherwise than recorded.
+        RuntimeError: the replayed episode ends otherwise than recorded.
     """
     last = len(recording.actions) - 1
     frames = last // FRAME_STEPS + 1 + (last % FRAME_STEPS > 0)
     frame = None
-    with VideoWriter(path, 1.0 / (FRAME_STEPS * CONTROL_PERIOD)) as video:
-        drawn = video_frames(task, result, recording)
+    with VideoWriter(path, FPS) as video:
+        drawn = video_frames(config, result, recording)
         for frame in tqdm(drawn, total=frames, unit="frame", desc=path.name, mininterval=1.0):
             video.write(frame)
         if frame is not None:
-            for _ in range(round(HOLD_SECONDS / (FRAME_STEPS * CONTROL_PERIOD))):
+            for _ in range(round(HOLD_SECONDS * FPS)):
                 video.write(frame)
 
 
 def video_frames(
-    task: Task, result: EpisodeResult, recording: Recording
+    config: EnvConfig, result: EpisodeResult, recording: Recording
 ) -> Iterator[NDArray[np.uint8]]:
-    """Act an episode out and draw it; yield (H, W, 3) uint8 frames.
+    """Replay an episode of a policy and draw it; yield (H, W, 3) uint8 frames.
 
-    The three cameras stand side by side, then the surroundings of the mouth, enlarged. Yellow is
-    where the mouth truly is and has been; cyan is where the policy was told that it is and will be.
+    The three cameras stand side by side, then the surroundings of the target, enlarged. Yellow is
+    the true target with its past; cyan are the present and predicted positions that the policy
+    observed.
     """
-    title = f"{result.policy} {result.arm}, seed {result.seed}".strip()
-    look = {"image_size": VIEW_SIZE, "shadows": True, "multisamples": MULTISAMPLES}
-    with closing(task.make(**look)) as env:
+    title = f"{result.policy} {result.condition}, seed {result.seed}".strip()
+    last = len(recording.actions) - 1
+    with closing(config.make(**LOOK)) as env:
         world = world_of(env)
+        world.renders_images = False  # of the policy's own cameras
         _, info = env.reset(seed=result.seed)
-        mouths: list[NDArray[np.float64]] = []
-        last = len(recording.actions) - 1
+        track: list[NDArray[np.float64]] = []
         for step, (vector, action) in enumerate(
             zip(recording.vectors, recording.actions, strict=True)
         ):
-            mouths = [*mouths[-TRACK_STEPS:], world.mouth_track[0]]
+            track = [*track[-TRACK_STEPS:], world.target_track()[0]]
             if step % FRAME_STEPS == 0 or step == last:
-                told = told_mouths(task.spec, vector)
                 caption = f"{title}: {info['phase']}, {step * CONTROL_PERIOD:.1f} s"
                 if step == last:
                     caption += f"  {result.failure.replace('_', ' ') or 'SUCCESS'}"
-                yield _draw(world, np.array(mouths), told, caption)
+                yield _draw(world, np.array(track), config.spec.target_positions(vector), caption)
             _, _, _, _, info = env.step(action)
         if bool(info["is_success"]) != result.is_success:
             raise RuntimeError(f"seed {result.seed} ends otherwise than recorded")
 
 
-def told_mouths(spec: ObservationSpec, vector: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the mouth positions in a vector (S,), (F, 3) m, world; F is 0 if it shows none."""
-    parts = split_vector(spec, vector)
-    if "mouth" in parts:
-        return parts["mouth"][None, :3].astype(np.float64)
-    if "prediction" in parts:
-        return parts["prediction"][: 4 * spec.frames].reshape(-1, 4)[:, 1:].astype(np.float64)
-    return np.empty((0, 3))
-
-
 def _draw(
-    world: FaceEnv, mouths: NDArray[np.float64], told: NDArray[np.float64], caption: str
+    world: FaceEnv, track: NDArray[np.float64], observed: NDArray[np.float64], caption: str
 ) -> NDArray[np.uint8]:
     views = world.renderer.render(world.data, CAMERAS)
-
-    def pixels(camera: str, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return project(world.model, world.data, camera, points, VIEW_SIZE)
-
-    close = _zoom(
-        views[CLOSE_UP],
-        pixels(CLOSE_UP, mouths[-1]),
-        pixels(CLOSE_UP, mouths),
-        pixels(CLOSE_UP, told),
-    )
     drawn = [
-        _dots(draw_track(views[camera], pixels(camera, mouths)), pixels(camera, told), 2)
-        for camera in CAMERAS
+        _dots(draw_track(views[c], _pixels(world, c, track)), _pixels(world, c, observed), 2)
+        for c in CAMERAS
     ]
-    drawn[0] = put_caption(drawn[0], caption)
-    return side_by_side([*drawn, close])
-
-
-def _zoom(
-    image: NDArray[np.uint8],
-    centre: NDArray[np.float64],
-    track: NDArray[np.float64],
-    told: NDArray[np.float64],
-) -> NDArray[np.uint8]:
-    """Enlarge what is around ``centre`` to the size of the image, and draw into that."""
-    height, width = image.shape[:2]
-    size = np.array([width, height]) / ZOOM
-    low = np.clip(np.nan_to_num(centre) - size / 2, 0, np.array([width, height]) - size).round()
+    # The surroundings of the target, enlarged to the size of the view.
+    height, width = VIEW_SIZE
+    line = _pixels(world, CLOSE_UP, track)
+    size = np.array([width, height])
+    low = np.clip(np.nan_to_num(line[-1]) - size / ZOOM / 2, 0, size - size / ZOOM).round()
     column, row = low.astype(int)
-    part = image[row : row + round(size[1]), column : column + round(size[0])]
+    part = views[CLOSE_UP][row : row + round(height / ZOOM), column : column + round(width / ZOOM)]
     large = np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC))
-    ringed = draw_track(large, (track - low) * ZOOM, radius=16)
-    return _dots(ringed, (told - low) * ZOOM, 5)
+    ringed = draw_track(large, (line - low) * ZOOM, radius=16)
+    close = _dots(ringed, (_pixels(world, CLOSE_UP, observed) - low) * ZOOM, 5)
+    return side_by_side([put_caption(drawn[0], caption), *drawn[1:], close])
+
+
+def _pixels(world: FaceEnv, camera: str, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (N, 3) m, world, in the view of a camera: (N, 2) pixels."""
+    return project(world.model, world.data, camera, points, VIEW_SIZE)
 
 
 def _dots(image: NDArray[np.uint8], points: NDArray[np.float64], radius: int) -> NDArray[np.uint8]:
@@ -423,6 +393,6 @@ def _dots(image: NDArray[np.uint8], points: NDArray[np.float64], radius: int) ->
     cv2.polylines(drawn, [fixed.reshape(-1, 1, 2)], False, CYAN, 1, cv2.LINE_AA, shift=4)
     for number, (x, y) in enumerate(fixed.tolist()):
         if number == 0:
-            cv2.circle(drawn, (x, y), (radius + 1) * 16, (0, 0, 0), -1, cv2.LINE_AA, shift=4)
+            cv2.circle(drawn, (x, y), (radius + 1) * 16, BLACK, -1, cv2.LINE_AA, shift=4)
         cv2.circle(drawn, (x, y), radius * 16, CYAN, -1, cv2.LINE_AA, shift=4)
     return drawn

@@ -31,7 +31,7 @@ _STEP_NAME = re.compile(r"step_(\d{8,})")
 
 
 def step_folder(run: Path, step: int) -> Path:
-    """Where a run keeps the checkpoint of a step."""
+    """Return the folder of the checkpoint of a step."""
     return run / CHECKPOINTS / f"step_{step:08d}"
 
 

@@ -128,7 +128,7 @@ def parse(
 ) -> Any:
     """Read the command line into ``options_type``.
 
-    ``--help`` prints every option with its default, and the example. Options are spelt with
+    ``--help`` prints every option with its default, and the example. Options have
     underscores; hyphens work too.
 
     Args:
@@ -216,7 +216,7 @@ def _known_options(
 
 
 def _box_to_line(text: str) -> str:
-    """What tyro says in its box, without the box, the help text and the footer."""
+    """Extract the message from tyro's box: no box, help text or footer."""
     lines = _ANSI.sub("", text).splitlines()
     body: list[str] = []
     for line in lines[1:]:
@@ -243,7 +243,7 @@ def _say(line: str, code: int) -> int:
 
 
 def _is_reader_gone() -> bool:
-    """Whether stdout is a pipe that nobody reads any more."""
+    """Return whether stdout is a pipe without a reader."""
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), select.POLLOUT)

@@ -40,7 +40,7 @@ def truncate_metrics(path: Path, step: int) -> None:
 
 
 class Board(Protocol):
-    """Where scalars are shown beside the file."""
+    """Display of scalars beside the file: TensorBoard or wandb."""
 
     def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
         """Show a number."""
@@ -154,7 +154,7 @@ def write_curves(path: Path, lines: Sequence[dict[str, Any]], title: str) -> boo
     Args:
         path: of the PNG.
         lines: as `read_metrics` gives them.
-        title: above the picture.
+        title: of the figure.
 
     Returns:
         Whether it was drawn: matplotlib may not be installed, and there may be nothing to draw.

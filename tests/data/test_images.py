@@ -59,5 +59,5 @@ def test_unknown_codec_lists_the_valid_ones() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"x", b"\xff\xd8\xff garbage"])
 def test_bytes_that_are_no_picture(data: bytes) -> None:
-    with pytest.raises(ValueError, match="no picture"):
+    with pytest.raises(ValueError, match="no image"):
         decode_image(np.frombuffer(data, np.uint8))

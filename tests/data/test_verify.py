@@ -132,7 +132,7 @@ DAMAGE: list[tuple[Callable[[h5py.File], Any], str]] = [
     (_attribute("expert", "another"), "do not fit 'content_sha256'"),
     (lambda file: file["qpos"].__setitem__((0, 0), 0.5), "do not fit 'content_sha256'"),
     (swap_frame, "frame 4 of 'top' cannot be read: its checksum is wrong"),
-    (_frame(np.frombuffer(b"no picture", np.uint8)), "frame 4 of 'top' cannot be decoded"),
+    (_frame(np.frombuffer(b"no image", np.uint8)), "frame 4 of 'top' cannot be decoded"),
     (_frame(make_images()["top"][4][:0]), "frame 4 of 'top' cannot be decoded"),
     (_frame(encode_image(make_frames(size=(24, 30))[0])), "frame 4 of 'top' is (24, 30, 3)"),
 ]

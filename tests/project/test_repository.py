@@ -6,8 +6,6 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 PACKAGES = ("robo_manip_baselines", "face_prediction")
 MAX_FILE_BYTES = 2_000_000  # data beyond that belongs in a release, not in everybody's clone
 MAX_SCRIPT_LINES = 40
@@ -56,19 +54,6 @@ def test_scripts_are_thin(repository: Path, project_files: list[Path]) -> None:
 def test_modules_live_with_what_they_are_about(project_files: list[Path]) -> None:
     vague = {"utils", "util", "common", "helpers", "misc"}
     assert [str(f) for f in project_files if vague & {*f.parts[:-1], f.stem}] == []
-
-
-@pytest.mark.parametrize(("package", "other"), [PACKAGES, PACKAGES[::-1]])
-def test_the_packages_meet_in_files_only(
-    package: str, other: str, repository: Path, project_files: list[Path]
-) -> None:
-    crossing = {
-        str(f): name
-        for f in python_files(project_files, package)
-        for name in imported_modules(repository / f)
-        if name.split(".")[0] == other
-    }
-    assert crossing == {}
 
 
 def test_nothing_is_pickled(repository: Path, project_files: list[Path]) -> None:

@@ -112,7 +112,7 @@ class CameraRenderer:
 
 
 class _Target:
-    """What exists only while there is an OpenGL context: context, buffers and scene."""
+    """Context, buffers and scene, while there is an OpenGL context."""
 
     def __init__(self, settings: CameraRenderer) -> None:
         self._process = os.getpid()

@@ -80,7 +80,7 @@ class ExpertPhase(Protocol):
     """A stretch of an expert's work."""
 
     def start(self, view: ExpertView, last: Command) -> None:
-        """Begin, the gripper having been told to be at ``last``."""
+        """Begin, ``last`` being the last command."""
         ...
 
     def step(self, view: ExpertView) -> Command:
@@ -163,7 +163,7 @@ class Approach:
     That is lines 9 to 15 of the paper's Algorithm 1.
 
     The velocity is (mouth - gripper) / (limit - t), with t since the lift and the gripper where it
-    was last told to be.
+    was last commanded.
 
     Args:
         limit: s since the lift.

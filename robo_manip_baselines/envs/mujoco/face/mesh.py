@@ -310,7 +310,7 @@ def _distance(grid: Floats, line: Floats) -> Floats:
 
 
 def _inside(grid: Floats, ring: Floats) -> NDArray[np.bool_]:
-    """Whether grid points lie in a polygon (even-odd rule)."""
+    """Return whether grid points lie in a polygon (even-odd rule)."""
     x, y = grid[..., 0], grid[..., 1]
     odd = np.zeros(x.shape, dtype=bool)
     for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):

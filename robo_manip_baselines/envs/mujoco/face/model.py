@@ -171,7 +171,7 @@ class FaceModel:
 def world_from_body(orientation: ArrayLike) -> Floats:
     """Body orientation in the world (..., 4) of a recorded camera-from-head one (..., 4), wxyz.
 
-    World and body frame name the camera's and the head's axes anew by the same cyclic exchange
+    World and body frame rename the camera's and the head's axes by the same cyclic exchange
     (x, y, z) -> (z, x, y), so the rotation's axis goes through that exchange too.
     """
     quat = np.asarray(orientation, float)[..., [0, 3, 1, 2]]

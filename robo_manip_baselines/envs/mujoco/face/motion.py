@@ -172,7 +172,7 @@ class MotionLibrary:
         )
 
     def starts(self, duration: float = SEGMENT_DURATION) -> NDArray[np.int64]:
-        """How many frames of each run can start a segment of ``duration`` seconds; (R,)."""
+        """Return, (R,), how many frames of each run can start a segment of ``duration`` s."""
         return np.maximum(self.run_length - math.ceil(duration * self.fps), 0)
 
     def draw(

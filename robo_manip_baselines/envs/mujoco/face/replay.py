@@ -1,4 +1,4 @@
-"""Where the mouth is at every instant of an episode, now and in the frames ahead.
+"""Replay of a recorded motion: the mouth at every instant of an episode, now and ahead.
 
 Legend: P physics steps, T control steps, K = 6 frames from now to the longest horizon.
 """
@@ -15,11 +15,11 @@ from robo_manip_baselines.envs.mujoco.face.motion import MotionSegment
 from robo_manip_baselines.observation import FRAME_PERIOD, MAX_HORIZON
 
 FACE_MOTIONS = ("episode", "after_lift")
-"""When the recorded motion starts: with the episode (paper, section IV.C), or when the cube has
+"""Start of the recorded motion: with the episode (paper, section IV.C), or when the cube has
 been lifted (paper, Algorithm 1, line 12)."""
 
 FRAMES_AHEAD = np.arange(MAX_HORIZON + 1) * FRAME_PERIOD
-"""s ahead at which the true mouth is told: now and at 1 ... 5 frames of 1/30 s."""
+"""s ahead at which the true mouth is known: now and at 1 ... 5 frames of 1/30 s."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class FaceReplay:
         bodies: for each mocap body, positions (P, 3) m and orientations (P, 4) wxyz, world.
         mouth: (T, K, 3) m, world: the mouth now and at ``FRAMES_AHEAD``.
         predicted: (T, K - 1, 3) m, world: the mouth at ``FRAMES_AHEAD`` but for now, as a trained
-            predictor foretold it; None if the recorded motion came without. Exact at video frames;
+            predictor forecast it; None if the recorded motion came without. Exact at video frames;
             between them the predictor's last error is held.
         jaw: (T,) m between the inner lips.
         opening: (T, 2) m, half width and half height of the mouth's opening.

@@ -1,0 +1,106 @@
+"""Floors of the packages: a folder imports only from folders below it (docs/architecture.md)."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROBOT = (
+    "commands",
+    "benchmark",
+    "teleop",
+    "rollout",
+    "training",
+    "policy",
+    "data",
+    "envs.mujoco.tasks",
+    "envs.mujoco.expert",
+    "envs.mujoco.face",
+    "envs.mujoco.cell",
+    "observation",
+    "runs",
+)
+FACE = (
+    "commands",
+    "live",
+    "evaluation",
+    "training",
+    "models",
+    "dataset",
+    "prediction",
+    "forecast",
+    "motion",
+    "tracking",
+)
+FLOORS = {"robo_manip_baselines": ROBOT, "face_prediction": FACE}
+BENEATH = "robo_manip_baselines.runs"
+"""What face_prediction may import of the other package."""
+
+
+def imported(source: str) -> set[str]:
+    """Absolute names of imported modules, and of names that may be modules, at any depth."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return names
+
+
+def floor_of(package: str, module: str) -> int | None:
+    """Number of a module's floor, 0 on top; None for what lies beside the folders."""
+    inside = f"{module.removeprefix(package).lstrip('.')}."
+    for number, folder in enumerate(FLOORS[package]):
+        if inside.startswith(f"{folder}."):
+            return number
+    return None
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_a_folder_imports_only_from_folders_below_it(package: str, repository: Path) -> None:
+    upward = []
+    for path in sorted((repository / package).rglob("*.py")):
+        module = ".".join(path.relative_to(repository).with_suffix("").parts)
+        own = floor_of(package, module)
+        for name in sorted(imported(path.read_text(encoding="utf-8"))):
+            other = floor_of(package, name) if name.startswith(f"{package}.") else None
+            if own is not None and other is not None and other < own:
+                upward.append(f"{module} imports {name}")
+    assert upward == []
+
+
+def test_every_folder_has_a_floor(repository: Path) -> None:
+    for package, floors in FLOORS.items():
+        for path in (repository / package).rglob("*.py"):
+            parts = path.relative_to(repository / package).parts
+            module = ".".join([package, *parts[:-1]])
+            is_between = any(floor.startswith(".".join(parts[:-1])) for floor in floors)
+            assert floor_of(package, module) is not None or is_between, path
+
+
+def test_the_packages_meet_in_files_and_in_runs(repository: Path) -> None:
+    for path in (repository / "face_prediction").rglob("*.py"):
+        for name in imported(path.read_text(encoding="utf-8")):
+            if name.startswith("robo_manip_baselines"):
+                assert f"{name}.".startswith(f"{BENEATH}."), f"{path} imports {name}"
+    for path in (repository / "robo_manip_baselines").rglob("*.py"):
+        names = imported(path.read_text(encoding="utf-8"))
+        assert not any(name.split(".")[0] == "face_prediction" for name in names), path
+
+
+def test_runs_know_no_faces_and_no_robots(repository: Path) -> None:
+    heavy = {"torch", "mujoco", "gymnasium", "mediapipe", "cv2", "h5py"}
+    for path in (repository / "robo_manip_baselines/runs").rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        top = {
+            alias.name.split(".")[0]
+            if isinstance(node, ast.Import)
+            else str(node.module).split(".")[0]
+            for node in tree.body
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for alias in node.names
+        }
+        assert not top & heavy, path
