@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel, kl_divergence
 from robo_manip_baselines.policy.act.resnet import FrozenBatchNorm, ResNet18
-from robo_manip_baselines.policy.interface import Batch, Sizes
+from robo_manip_baselines.policy.interface import Batch, PolicyDims
 
 
 class PublicAttention(nn.Module):
@@ -72,7 +72,7 @@ class PublicResNet(ResNet18):
     """The same network in the public order: normalisation on its own, images as they come."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return (I, 512, h, w) for normalised (I, 3, H, W) float pictures."""
+        """Return (I, 512, h, w) for normalised (I, 3, H, W) float images."""
 
         def run(x: Tensor, conv: nn.Module, norm: nn.Module) -> Tensor:
             scale, shift = cast("FrozenBatchNorm", norm).scale_and_shift()
@@ -92,8 +92,8 @@ class PublicResNet(ResNet18):
 class PublicWay(ActModel):
     """ActModel's parameters outside the Transformers, computed with as the public code does."""
 
-    def __init__(self, config: ActConfig, sizes: Sizes) -> None:
-        super().__init__(config, sizes)
+    def __init__(self, config: ActConfig, dims: PolicyDims) -> None:
+        super().__init__(config, dims)
 
         def stack(number: int, decoder: bool = False) -> nn.ModuleList:
             return nn.ModuleList(PublicLayer(config, decoder) for _ in range(number))
@@ -108,13 +108,13 @@ class PublicWay(ActModel):
             self.vision.backbone = PublicResNet()
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the loss and its parts; ``batch.images`` are (B, N, 3, H, W) from 0 to 1."""
+        """Return the loss and its parts; ``batch.images`` are (B, 1, N, 3, H, W) from 0 to 1."""
         cvae = self.cvae
         assert cvae is not None
         tokens = torch.cat(
             [
                 cvae.class_token.expand(len(batch.state), 1, -1),
-                cvae.state_projection(batch.state)[:, None],
+                cvae.state_projection(batch.state),
                 cvae.action_projection(batch.action),
             ],
             dim=1,
@@ -132,12 +132,12 @@ class PublicWay(ActModel):
     def _actions(self, state: Tensor, images: Tensor | None, latent: Tensor | None) -> Tensor:
         if latent is None:
             latent = state.new_zeros((len(state), self.config.latent_size))
-        tokens = [self.latent_projection(latent)[:, None], self.state_projection(state)[:, None]]
+        tokens = [self.latent_projection(latent)[:, None], self.state_projection(state)]
         position = self.token_positions
         if self.vision is not None and images is not None:
             mean, scale = self.vision.backbone.mean / 255.0, self.vision.backbone.scale * 255.0
-            normal = (images - mean) * scale
-            for camera in range(images.shape[1]):
+            normal = (images[:, -1] - mean) * scale
+            for camera in range(normal.shape[1]):
                 features = self.vision.projection(self.vision.backbone(normal[:, camera]))
                 tokens.append(features.flatten(2).transpose(1, 2))
             position = torch.cat([position, self.vision.positions.flatten(0, 1)])

@@ -26,7 +26,7 @@ from torch import Tensor  # noqa: E402
 
 from robo_manip_baselines.policy.act.config import ActConfig  # noqa: E402
 from robo_manip_baselines.policy.act.model import ActModel  # noqa: E402
-from robo_manip_baselines.policy.interface import Batch, PolicyModel, Sizes  # noqa: E402
+from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel  # noqa: E402
 from robo_manip_baselines.runs.errors import RequestError, require_choice  # noqa: E402
 
 PHASES = ("transfer", "forward", "backward", "optimiser")
@@ -94,12 +94,12 @@ def make_batch(options: Options, size: int, as_float: bool) -> Batch:
     generator = torch.Generator().manual_seed(0)
     chunk = ActConfig().chunk_size
     is_pad = torch.arange(chunk)[None] >= torch.linspace(chunk // 5, chunk, size).long()[:, None]
-    shape = (size, options.num_cameras, *options.image_size, 3)
+    shape = (size, 1, options.num_cameras, *options.image_size, 3)
     images = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
     if as_float:
-        images = images.permute(0, 1, 4, 2, 3).float().div_(255.0).contiguous()
+        images = images.permute(0, 1, 2, 5, 3, 4).float().div_(255.0).contiguous()
     batch = Batch(
-        state=torch.randn(size, options.state_size, generator=generator),
+        state=torch.randn(size, 1, options.state_size, generator=generator),
         images=images if options.num_cameras else None,
         action=torch.randn(size, chunk, options.action_size, generator=generator),
         is_pad=is_pad,
@@ -146,7 +146,7 @@ def record(compute: Callable[[], Any]) -> tuple[torch.cuda.CUDAGraph, Any]:
     return graph, result
 
 
-class Trainer:
+class TimedNetwork:
     """Runs steps of one network and takes the time of each phase."""
 
     def __init__(self, model: PolicyModel, batch: Batch, options: Options, ours: bool) -> None:
@@ -232,11 +232,11 @@ def predictor(model: PolicyModel, options: Options, ours: bool) -> Callable[[], 
     @torch.inference_mode()
     def eager() -> Tensor:
         images = None if batch.images is None else batch.images.to(device, non_blocking=True)
-        return predict(batch.state.to(device, non_blocking=True), images).cpu()
+        return predict(batch.state.to(device, non_blocking=True), images, None).cpu()
 
     if not (ours and options.cuda_graph):
         return eager
-    graph, result = record(lambda: predict(on_device.state, on_device.images))
+    graph, result = record(lambda: predict(on_device.state, on_device.images, None))
 
     @torch.inference_mode()
     def replayed() -> Tensor:
@@ -274,14 +274,16 @@ def main() -> None:
         f"{', compiled' * options.compile}{', CUDA graph' * options.cuda_graph}"
         f"{', processor time' * options.processor_time}"
     )
-    sizes = Sizes(options.state_size, options.action_size, options.num_cameras, options.image_size)
-    models: dict[str, PolicyModel] = {"ours": ActModel(ActConfig(), sizes)}
+    dims = PolicyDims(
+        options.state_size, options.action_size, options.num_cameras, options.image_size
+    )
+    models: dict[str, PolicyModel] = {"ours": ActModel(ActConfig(), dims)}
     if options.public:
-        models["public way"] = PublicWay(ActConfig(paper_compat=True), sizes)
+        models["public way"] = PublicWay(ActConfig(paper_compat=True), dims)
     if options.steps:
         print_steps(
             {
-                key: Trainer(
+                key: TimedNetwork(
                     model,
                     make_batch(options, options.batch_size, as_float=key != "ours"),
                     options,
@@ -300,22 +302,22 @@ def main() -> None:
             print(f"| {key} | {cells} |", flush=True)
 
 
-def print_steps(trainers: dict[str, Trainer], steps: int) -> None:
+def print_steps(networks: dict[str, TimedNetwork], steps: int) -> None:
     """Steps of each network in turn, so that whatever else the machine does is shared."""
-    for trainer in trainers.values():
+    for network in networks.values():
         for _ in range(WARM_UP):
-            trainer.step()
-    phases: dict[str, list[list[float]]] = {key: [] for key in trainers}
+            network.step()
+    phases: dict[str, list[list[float]]] = {key: [] for key in networks}
     for _ in range(steps):
-        for key, trainer in trainers.items():
-            phases[key].append(trainer.step())
+        for key, network in networks.items():
+            phases[key].append(network.step())
     print(f"\n| training step, ms | {' | '.join(PHASES)} | sum | without waiting |")
     print("|---|" + "---|" * (len(PHASES) + 2))
     sums: dict[str, float] = {}
     for key, rows in phases.items():
         medians = [statistics.median(column) for column in zip(*rows, strict=True)]
         sums[key] = sum(medians)
-        cells = [*medians, sums[key], trainers[key].run(steps)]
+        cells = [*medians, sums[key], networks[key].run(steps)]
         print(f"| {key} | {' | '.join(f'{1e3 * cell:.1f}' for cell in cells)} |", flush=True)
     if len(sums) == 2:
         print(f"\nours is {sums['public way'] / sums['ours']:.1f} times as fast")

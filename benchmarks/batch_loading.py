@@ -18,16 +18,17 @@ import torch
 
 from robo_manip_baselines.data import EpisodeReader, decode_image, list_episodes
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
-from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.data.normalization import mean_std
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.spec import parse_image_size
+from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.batching import BatchLoader
 from robo_manip_baselines.training.device import choose_device
-from robo_manip_baselines.training.images import FrameSource, fit_image, processors
-from robo_manip_baselines.training.sampling import Schedule
+from robo_manip_baselines.training.images import ImageStore, fit_image, processors
+from robo_manip_baselines.training.sampling import ExampleSampler
 
 EXAMPLE = "python benchmarks/batch_loading.py --batch_size 8 --image_size 240x320"
 
@@ -70,19 +71,19 @@ class Source:
         given = self.demonstrations
         return replace(self, demonstrations=replace(given, spec=replace(given.spec, cameras=())))
 
-    def loader(self, frames: FrameSource | None, depth: int = 4) -> BatchLoader:
+    def loader(self, images: ImageStore | None, depth: int = 4) -> BatchLoader:
         """Make a loader over all episodes and frames."""
-        given = self.demonstrations
+        given, model = self.demonstrations, PolicyModel()
+        model.chunk_size, model.noise_size = CHUNK_SIZE, NOISE_SIZE
         return BatchLoader(
             given,
-            Normalization.of(given.state, given.action),
+            mean_std(given.state, given.action),
             range(len(given.seeds)),
-            Schedule(given.lengths, "frame", self.options.batch_size, 0),
-            chunk_size=CHUNK_SIZE,
-            noise_size=NOISE_SIZE,
+            ExampleSampler(given.lengths, "frame", self.options.batch_size, 0),
+            model,
             seed=0,
             device=self.device,
-            frames=frames,
+            images=images,
             depth=depth,
         )
 
@@ -92,9 +93,9 @@ class Source:
             torch.cuda.synchronize(self.device)
 
 
-def batch_row(name: str, source: Source, frames: FrameSource | None, batches: int) -> str:
+def batch_row(name: str, source: Source, images: ImageStore | None, batches: int) -> str:
     """Time batches one after another, then with a pause for each step; return a table row."""
-    loader = source.loader(frames)
+    loader = source.loader(images)
     first = 10
     for _ in loader.batches(0, first):
         source.wait()
@@ -121,7 +122,7 @@ def batch_row(name: str, source: Source, frames: FrameSource | None, batches: in
 def phase_rows(source: Source) -> Iterator[str]:
     """Time the parts of one batch, one after another in one thread; yield table rows."""
     given, size = source.demonstrations, source.options.batch_size
-    schedule = Schedule(given.lengths, "frame", size, 0)
+    sampler = ExampleSampler(given.lengths, "frame", size, 0)
     loader = source.blind.loader(None, depth=0)
     times: dict[str, list[float]] = {}
 
@@ -137,21 +138,21 @@ def phase_rows(source: Source) -> Iterator[str]:
     with contextlib.ExitStack() as files:
         episodes = [files.enter_context(EpisodeReader(path)) for path in given.paths]
         for step in range(1, 12):
-            with timed("schedule: which examples"):
-                examples = schedule.batch(step)
+            with timed("sampler: examples of the step"):
+                examples = sampler.batch(step)
             with timed("vectors: chunks, noise, copying"):
                 loader.batch(step)
             chosen = [(episodes[e], c, int(t)) for e, t in examples for c in CAMERAS]
             with timed("images: reading and checksums"):
                 data = [episode.encoded_frame(camera, t) for episode, camera, t in chosen]
             with timed("images: decoding"):
-                pictures = [decode_image(encoded) for encoded in data]
+                decoded = [decode_image(encoded) for encoded in data]
             with timed("images: shrinking"):
-                pictures = [fit_image(picture, given.spec.image_size) for picture in pictures]
+                decoded = [fit_image(image, given.spec.image_size) for image in decoded]
             with timed("images: putting together"):
                 joined = out.numpy().reshape(-1, *out.shape[2:])
-                for place, picture in enumerate(pictures):
-                    joined[place] = picture
+                for place, image in enumerate(decoded):
+                    joined[place] = image
             if source.device.type == "cuda":
                 with timed("images: to the device"):
                     out.to(source.device, non_blocking=True)
@@ -198,16 +199,16 @@ def main() -> None:
         )
         print(batch_row("vectors only", source.blind, None, 10 * options.batches), flush=True)
         threads = options.threads or None
-        with FrameSource(given, memory_budget=0, threads=threads) as frames:
-            print(batch_row("images decoded ahead", source, frames, options.batches), flush=True)
+        with ImageStore(given, memory_budget=0, threads=threads) as images:
+            print(batch_row("images decoded ahead", source, images, options.batches), flush=True)
         start = time.perf_counter()
-        with FrameSource(given, threads=threads) as frames:
+        with ImageStore(given, threads=threads) as images:
             loading = time.perf_counter() - start
-            if frames.held is None:
+            if images.held is None:
                 print("\nnot enough free memory to hold all images")
                 return
-            print(batch_row("images held", source, frames, options.batches))
-            print(f"\nholding {frames.held.nbytes / 1e9:.2f} GB of images took {loading:.1f} s")
+            print(batch_row("images held", source, images, options.batches))
+            print(f"\nholding {images.held.nbytes / 1e9:.2f} GB of images took {loading:.1f} s")
 
 
 def device_name(device: torch.device) -> str:

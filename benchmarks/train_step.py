@@ -1,11 +1,11 @@
 """Time of each phase of real training steps: data, transfer, forward, backward, optimiser.
 
-Takes the command line of ``bin/Train.py`` and trains as it does, but writes nothing. Without
-``--dataset`` it makes up episodes whose pictures are as hard to decode as rendered ones.
+Takes the command line of ``bin/Train.py`` and trains as it does, into a temporary folder. Without
+``--dataset`` it makes up episodes whose images are as hard to decode as rendered ones.
 Prints a Markdown table.
 Run: ``python benchmarks/train_step.py Act --preset cpu --steps 60``.
 
-- ``wait for data``: what a step waits for its batch while batches are made ahead of it.
+- ``wait for data``: wait of a step for its batch while batches are made ahead of it.
 - ``make a batch``: one batch made with nothing going on beside it, copy to the device included.
 - ``transfer``: its copy from page-locked memory to the device alone; not on CPU.
 - ``forward``, ``backward``, ``optimizer``: on CUDA measured with events on the stream.
@@ -17,31 +17,37 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 prepare_pytorch()  # before PyTorch is imported: how its threads wait
 
 import torch  # noqa: E402
 
+from robo_manip_baselines.commands.train import parse_config  # noqa: E402
 from robo_manip_baselines.data import encode_image, episode_path, write_episode  # noqa: E402
 from robo_manip_baselines.data.example import make_arrays, make_attributes  # noqa: E402
 from robo_manip_baselines.policy.interface import Batch  # noqa: E402
+from robo_manip_baselines.runs.metrics import read_metrics  # noqa: E402
+from robo_manip_baselines.training.config import METRICS, TrainConfig  # noqa: E402
 from robo_manip_baselines.training.device import (  # noqa: E402
+    PHASES,
     Processes,
+    autocast_type,
     choose_device,
     describe_device,
-    prepare_device,
 )
-from robo_manip_baselines.training.options import parse_options  # noqa: E402
-from robo_manip_baselines.training.setup import Job  # noqa: E402
-from robo_manip_baselines.training.trainer import Parts, assembled  # noqa: E402
+from robo_manip_baselines.training.images import ImageStore  # noqa: E402
+from robo_manip_baselines.training.setup import TrainSetup  # noqa: E402
+from robo_manip_baselines.training.trainer import Trainer, train  # noqa: E402
 
 EPISODES = 10
 EPISODE_STEPS = 120
@@ -76,31 +82,34 @@ def time_transfer(batch: Batch, device: torch.device, repeats: int = 20) -> floa
     return (time.perf_counter() - start) / repeats
 
 
-def measure(parts: Parts, steps: int, device: torch.device) -> dict[str, float]:
-    """Seconds by phase, means over ``steps`` steps after the warm-up."""
-    clock = parts.train_step.clock
-    started = time.perf_counter()
-    for step, batch in enumerate(parts.loader.batches(0, WARM_UP + steps)):
-        if step == WARM_UP:
-            clock.read()
-            clock.skip()
-            started = time.perf_counter()
-        parts.train_step(batch, step)
-    phases = clock.read()  # waits for the device
-    whole = (time.perf_counter() - started) / steps
-    start, made = time.perf_counter(), min(steps, 10)
-    batches = [parts.loader.batch(step) for step in range(made)]
-    if device.type == "cuda":
+def time_batches(config: TrainConfig[Any], device: torch.device) -> dict[str, float]:
+    """Seconds to make a batch, and to copy it to the device."""
+    setup = TrainSetup.load(config)
+    images = ImageStore(setup.demonstrations) if setup.dims.cameras else None
+    loader = Trainer(setup, None, device, Processes(), images=images).loader
+    loader.batch(0)
+    start, made = time.perf_counter(), min(setup.total_steps, 10)
+    batches = [loader.batch(step) for step in range(made)]
+    on_cuda = device.type == "cuda"
+    if on_cuda:
         torch.cuda.synchronize(device)
     making = (time.perf_counter() - start) / made
-    transfer = time_transfer(batches[0], device) if device.type == "cuda" else float("nan")
-    return {
-        "wait for data": phases["data"],
-        "make a batch": making,
-        "transfer": transfer,
-        **{phase: phases[phase] for phase in ("forward", "backward", "optimizer")},
-        "step": whole,
+    transfer = time_transfer(batches[0], device) if on_cuda else float("nan")
+    return {"make a batch": making, "transfer": transfer}
+
+
+def time_phases(config: TrainConfig[Any]) -> dict[str, float]:
+    """Seconds of each phase, means over the steps after the warm-up, from the run's metrics."""
+    train(config)
+    lines = [x for x in read_metrics(config.folder / METRICS) if x["kind"] == "train"]
+    before, lines = lines[0], lines[1:]
+    steps = np.diff([before["step"], *(line["step"] for line in lines)])
+    phases = {
+        phase: float(np.average([line[f"seconds_{phase}"] for line in lines], weights=steps))
+        for phase in PHASES
     }
+    whole = (lines[-1]["seconds"] - before["seconds"]) / steps.sum()
+    return {**phases, "step": whole}
 
 
 def main() -> None:
@@ -108,29 +117,40 @@ def main() -> None:
     args = sys.argv[1:]
     if not any(arg.startswith("--steps") for arg in args):
         args += ["--steps", "50"]
-    options = parse_options(args, torch.cuda.is_available())
-    device = choose_device(options.device)
-    prepare_device(device, options.training.compile)
+    config = parse_config(args)
+    device = choose_device(config.device)
     with tempfile.TemporaryDirectory() as folder:
-        if options.dataset is None:
-            make_episodes(Path(folder), options.spec.cameras, options.spec.image_size)
-            options = parse_options([*args, "--dataset", folder], torch.cuda.is_available())
-        job = Job.of(options)
-        steps = job.total_steps
-        with assembled(job, None, device, Processes()) as parts:
-            phases = measure(parts, steps, device)
-            precision = "bf16" if parts.train_step.autocast else "fp32"
-    shape = f"{len(options.spec.cameras)} cameras"
-    if options.spec.cameras:
-        shape += f" of {options.image_size}"
+        if config.dataset is None:
+            make_episodes(Path(folder, "episodes"), config.spec.cameras, config.spec.image_size)
+            config = replace(config, dataset=Path(folder, "episodes"))
+        steps = config.training.steps or 0
+        if steps <= WARM_UP:
+            raise RequestError(f"steps {steps}: must be more than the {WARM_UP} of the warm-up")
+        config = replace(
+            config,
+            out=Path(folder, "run"),
+            logger="none",
+            log_every=WARM_UP,
+            validate_every=steps,
+            checkpoint_every=steps,
+        )
+        phases = time_phases(config)
+        making = time_batches(config, device)
+    cameras = len(config.spec.cameras)
+    precision = autocast_type(config.training.precision, device, bool(cameras))
+    shape = f"{cameras} cameras"
+    if cameras:
+        shape += f" of {config.spec.image_size[0]}x{config.spec.image_size[1]}"
     print(
-        f"{options.policy}, preset {options.preset}, batch {options.training.batch_size}, {shape}, "
-        f"{describe_device(device)}, {precision}, PyTorch {torch.__version__}, {steps} steps"
+        f"{config.policy}, preset {config.preset}, batch {config.training.batch_size}, {shape}, "
+        f"{describe_device(device)}, {'bf16' if precision else 'fp32'}, PyTorch "
+        f"{torch.__version__}, {steps} steps"
     )
     if device.type == "cuda":
         print(f"{torch.cuda.max_memory_allocated(device) / 2**30:.2f} GiB of GPU memory")
     print("\n| phase | ms |\n|---|---|")
-    for name, seconds in phases.items():
+    rows = {"wait for data": phases.pop("data"), **making, **phases}
+    for name, seconds in rows.items():
         print(f"| {name} | {'-' if np.isnan(seconds) else f'{1e3 * seconds:.2f}'} |")
 
 

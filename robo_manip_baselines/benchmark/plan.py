@@ -182,7 +182,7 @@ def _training(
     plan: Plan, arm: ArmLine, train_seed: int, demonstrations: tuple[Unit, ...], files: _Files
 ) -> Unit:
     # Imported here: a plan is read without what training needs.
-    from robo_manip_baselines.training.options import parse_options
+    from robo_manip_baselines.commands.train import parse_config
 
     preset = plan.preset
     args = [arm.policy, "--preset", preset.train_preset, "--env", plan.env, *arm.train_args]
@@ -195,7 +195,7 @@ def _training(
         f"{arm.name}_seed{train_seed}",
         f"{_WORK}:train",
         # What the options come to: another default in the preset makes another training.
-        {"args": args, "options": parse_options(args, has_gpu=False).to_config()},
+        {"args": args, "options": parse_config(args, has_gpu=False).to_json()},
         needs=demonstrations,
         files=files.of(arm),
         threads=preset.threads,

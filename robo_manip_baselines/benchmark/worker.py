@@ -88,11 +88,12 @@ def train(settings: Mapping[str, Any]) -> int | None:
     from robo_manip_baselines.training.requirements import prepare_pytorch
 
     prepare_pytorch()
-    from robo_manip_baselines.commands.train import train
+    from robo_manip_baselines.commands.train import parse_config
     from robo_manip_baselines.policy.checkpoint import TRAINER, TRAINER_TENSORS
     from robo_manip_baselines.runs.checkpoints import list_checkpoints
+    from robo_manip_baselines.training.trainer import train
 
-    if code := train([*settings["args"], "--resume"]):
+    if code := train(parse_config(settings["args"]), resume=True):
         return code
     *earlier, (_, last) = list_checkpoints(Path(OUT))
     for _, folder in earlier:

@@ -1,47 +1,197 @@
-"""``bin/Train.py``: what it does and says."""
+"""``bin/Train.py``: preset, then YAML file, then command line; closing table and exit codes."""
 
 from __future__ import annotations
 
-import contextlib
+import dataclasses
 import logging
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
-import torch
+import tyro
 
-from robo_manip_baselines.policy.checkpoint import Checkpoint, read_checkpoint
-from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
-from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
-from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import locked
-from robo_manip_baselines.runs.interrupt import StopRequest
-from robo_manip_baselines.runs.metrics import MetricsLog, open_board, read_metrics, write_curves
-from robo_manip_baselines.training.device import (
-    Processes,
-    choose_device,
-    describe_device,
-    prepare_device,
-)
-from robo_manip_baselines.training.options import FREE, TrainOptions, parse_options
-from robo_manip_baselines.training.requirements import prepare_pytorch
-from robo_manip_baselines.training.run_folder import (
+from robo_manip_baselines.observation import Corruption
+from robo_manip_baselines.policy.registry import policy_names, policy_presets
+from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.metrics import read_metrics
+from robo_manip_baselines.runs.progress import closing_table
+from robo_manip_baselines.training.config import (
     CONFIG,
-    CURVES,
     METRICS,
-    require_same_config,
-    start_anew,
-    write_config,
+    Network,
+    TrainConfig,
+    read_config,
 )
-from robo_manip_baselines.training.setup import Job
-from robo_manip_baselines.training.trainer import Outcome, Parts, Trainer, assembled
+from robo_manip_baselines.training.requirements import prepare_pytorch
 
 logger = logging.getLogger(__name__)
 
+EXAMPLE = "python bin/Train.py Act --obs current_pred --horizon 2 --seed 0"
 
-def train(args: Sequence[str]) -> int:
-    """Train what a command line asks for, then print a table and the next command.
+
+@dataclass(frozen=True)
+class TrainOptions(Generic[Network]):
+    """Train a policy on demonstrations."""
+
+    run: tyro.conf.OmitArgPrefixes[TrainConfig[Network]]
+    corruption: bool = True
+    """--no_corruption turns all corruption of the observations off."""
+    resume: bool = False
+    """Continue the run in the run folder."""
+    config: Path | None = None
+    """YAML file of options, such as the config.yaml of a run; the command line overrides it."""
+
+
+def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfig[Any]:
+    """Read a command line; its preset and its YAML file give the defaults.
+
+    Args:
+        args: without the name of the program.
+        has_gpu: decides the preset ``auto``; if None, PyTorch is asked where that is needed.
+
+    Raises:
+        RequestError: one line that names what is wrong and what is valid.
+        SystemExit: with code 0 after ``--help``.
+    """
+    is_help = any(arg in ("-h", "--help") for arg in args)
+    if not args or (args[0].startswith("-") and not is_help):
+        raise RequestError(f"name the policy to train first: {', '.join(policy_names())}")
+    policy = args[0] if not args[0].startswith("-") else policy_names()[0]
+    presets = policy_presets(policy)
+    file = _yaml_file(args)
+    values = read_config(file) if file else {}
+    if values.setdefault("policy", policy) != policy:
+        raise RequestError(f"'{file}' is of policy {values['policy']}, not {policy}")
+    preset = _last_value(args, "preset") or str(values.get("preset", "auto"))
+    if preset == "auto":
+        preset = _auto_preset(list(presets), False if is_help else has_gpu, is_quiet=is_help)
+    options = TrainOptions(TrainConfig.from_preset(policy, preset))
+    options = _with_budget(options, values)
+    if file:
+        options = _apply_yaml(file, {**values, "preset": preset}, options)
+    budgets = {name: _last_value(args, name) for name in ("epochs", "steps")}
+    options = _with_budget(options, budgets)
+    description = (
+        f"Train a policy on demonstrations. Policies: {', '.join(policy_names())}; the options and "
+        f"defaults below are those of {policy} with --preset {preset}. Presets of {policy}: "
+        f"{', '.join(presets)}."
+    )
+    options = _parse(options, list(args), description)
+    config = dataclasses.replace(options.run, preset=preset)
+    if not options.corruption:
+        spec = dataclasses.replace(config.spec, corruption=Corruption())
+        config = dataclasses.replace(config, spec=spec)
+    return config
+
+
+def _parse(options: TrainOptions[Any], args: list[str], description: str) -> TrainOptions[Any]:
+    kind: Any = TrainOptions[type(options.run.network)]
+    return parse(kind, EXAMPLE, description=description, args=args, default=options)
+
+
+def _auto_preset(presets: Sequence[str], has_gpu: bool | None, *, is_quiet: bool) -> str:
+    """Return ``paper`` where there is a GPU, else ``cpu``; the first preset where there is none."""
+    if has_gpu is None:
+        import torch
+
+        has_gpu = torch.cuda.is_available()
+    wanted = "paper" if has_gpu and "paper" in presets else "cpu"
+    name = wanted if wanted in presets else presets[0]
+    if not is_quiet:
+        found = "PyTorch finds a GPU" if has_gpu else "PyTorch finds no GPU"
+        choice = "" if "paper" in presets else f" (of {', '.join(presets)})"
+        logger.info("--preset auto: %s, so %s%s", found, name, choice)
+    return name
+
+
+def _with_budget(options: TrainOptions[Any], given: Mapping[str, Any]) -> TrainOptions[Any]:
+    """Let the one budget that is given, epochs or steps, replace the other's default."""
+    named = [name for name in ("epochs", "steps") if given.get(name) not in (None, "None")]
+    if len(named) != 1:
+        return options
+    budget = {"epochs": None, "steps": None, named[0]: 1}  # the value itself is parsed later
+    training = dataclasses.replace(options.run.training, **budget)
+    return dataclasses.replace(options, run=dataclasses.replace(options.run, training=training))
+
+
+def _apply_yaml(
+    file: Path, values: Mapping[str, Any], options: TrainOptions[Any]
+) -> TrainOptions[Any]:
+    """Parse a file's values as if they had been typed, so that they are checked the same way."""
+    known = [*options.run.to_json(), "corruption"]
+    args = [options.run.policy]
+    try:
+        for name, value in values.items():
+            require_choice("option", name, known)
+            if name == "policy" or value is None:
+                continue
+            if isinstance(value, bool):
+                args.append(f"--{name}" if value else f"--no_{name}")
+            elif isinstance(value, list):
+                args += [f"--{name}", *([str(part) for part in value] or ["none"])]
+            elif isinstance(value, dict):
+                raise RequestError(f"{name} must be one value or a list, not a mapping")
+            else:
+                args.append(f"--{name}={value}")
+        return _parse(options, args, "")
+    except RequestError as error:
+        raise RequestError(f"'{file}': {error}") from None
+
+
+def _yaml_file(args: Sequence[str]) -> Path | None:
+    """Return the file of defaults: ``--config``, else that of a run folder to resume."""
+    if given := _last_value(args, "config"):
+        return Path(given)
+    out = _last_value(args, "out")
+    saved = Path(out) / CONFIG if out else None
+    return saved if saved and "--resume" in args and saved.is_file() else None
+
+
+def _last_value(args: Sequence[str], name: str) -> str | None:
+    """Return the value after ``--name`` or ``--name=``; None where it is not given."""
+    found: str | None = None
+    for place, arg in enumerate(args):
+        option, sign, value = arg.partition("=")
+        if option != f"--{name}":
+            continue
+        if sign:
+            found = value
+        elif place + 1 < len(args):
+            found = args[place + 1]
+    return found
+
+
+def summary(config: TrainConfig[Any], first_step: int) -> str:
+    """Return the closing table of a run, from its metrics.
+
+    Args:
+        config: of the run.
+        first_step: steps done before this process.
+    """
+    losses = {"train": "-", "validation": "-"}
+    step, seconds = 0, 0.0
+    for line in read_metrics(config.folder / METRICS):
+        step, seconds = line["step"], line.get("seconds", seconds)
+        names = [n for n in line if n not in ("kind", "step", "epoch", "learning_rate")]
+        parts = [f"{n} {line[n]:.4g}" for n in names if not n.startswith("seconds")]
+        losses[line["kind"]] = ", ".join(parts)
+    rows = {
+        "steps": str(step) + (f" ({first_step} of them before)" if first_step else ""),
+        "time": f"{seconds:.1f} s",
+        "speed": f"{step / max(seconds, 1e-9):.1f} steps/s",
+        "training": losses["train"],
+        "held out": losses["validation"],
+        "written to": str(config.folder),
+    }
+    return closing_table(rows)
+
+
+def main(args: Sequence[str]) -> int:
+    """Run ``bin/Train.py``.
 
     Returns:
         The exit code: 0, or 130 after an interruption whose state is saved.
@@ -49,154 +199,23 @@ def train(args: Sequence[str]) -> int:
     Raises:
         RequestError: the request cannot be met.
     """
-    processes = Processes.from_environment()
-    if not processes.is_main:
-        logging.getLogger().setLevel(logging.WARNING)
-    options = parse_options(args, torch.cuda.is_available())
-    device = choose_device(options.device, processes.local_rank)
-    prepare_device(device, options.training.compile)
-    with processes.joined(device):
-        # A function of its own: nothing of it must outlive the block and hold on to the processes.
-        return _train(options, device, processes)
-
-
-def _train(options: TrainOptions[Any], device: torch.device, processes: Processes) -> int:
-    run = options.folder
-    with contextlib.ExitStack() as stack:
-        job = Job.of(options)
-        if processes.is_main:
-            stack.enter_context(locked(run))
-        start = resume_point(options, job)
-        if start and start.step >= job.total_steps:
-            logger.info("%s is finished: %d steps", run, start.step)
-            if processes.is_main:
-                _finish(options)
-            return 0
-        processes.wait()  # until every process has seen the folder as it was
-        log = stack.enter_context(_open_log(options, start)) if processes.is_main else None
-        parts = stack.enter_context(assembled(job, start, device, processes))
-        _announce(job, parts, processes)
-        stop = StopRequest(once_more=processes.world_size == 1)
-        trainer = Trainer(job, parts, log=log, processes=processes, stop=lambda: stop.is_made)
-        with stop:
-            outcome = trainer.train()
-        if not processes.is_main:
-            return 0 if outcome.step == job.total_steps else EXIT_INTERRUPTED
-        if outcome.step < job.total_steps:
-            logger.info("stopped at step %d; go on with: %s", outcome.step, resume_line(options))
-            return EXIT_INTERRUPTED
-        print(table(outcome, start.step if start else 0, run))  # noqa: T201
-        _finish(options)
-    return 0
-
-
-def resume_point(options: TrainOptions[Any], job: Job) -> Checkpoint | None:
-    """Return the checkpoint that training goes on from, None to begin.
-
-    Raises:
-        RequestError: the run folder holds another run, or this one without ``--resume``; or the
-            demonstrations have changed since.
-    """
-    run = options.folder
-    if not list_checkpoints(run):
-        return None
-    require_same_config(run, options.to_config(), FREE)
-    checkpoint = read_checkpoint(run)
-    if not options.resume:
-        done = checkpoint.step >= job.total_steps
-        raise RequestError(
-            f"'{run}' holds this run, {'finished' if done else f'at step {checkpoint.step}'}; "
-            + ("choose another --out or --seed" if done else "--resume continues it")
-        )
-    if checkpoint.dataset["content_hash"] != job.demonstrations.content_hash:
-        raise RequestError(
-            f"the demonstrations in '{options.demonstrations}' are not the ones that '{run}' was "
-            "trained on; give those with --dataset, or choose another --out"
-        )
-    if checkpoint.spec != job.demonstrations.spec:
-        raise RequestError(
-            f"the error statistics are not the ones that '{run}' was trained with; give those with "
-            "--error_stats, or choose another --out"
-        )
-    return checkpoint
-
-
-def resume_line(options: TrainOptions[Any]) -> str:
-    """Return the command that goes on with a run."""
-    return f"python bin/Train.py {options.policy} --out {shlex.quote(str(options.folder))} --resume"
-
-
-def rollout_line(options: TrainOptions[Any]) -> str:
-    """Return the command that evaluates a run."""
-    return (
-        f"python bin/Rollout.py {options.env} --policy {options.policy} "
-        f"--checkpoint {shlex.quote(str(options.folder))}"
-    )
-
-
-def table(outcome: Outcome, first_step: int, run: Path) -> str:
-    """Lay out the closing table."""
-    rows = {
-        "steps": str(outcome.step) + (f" ({first_step} of them before)" if first_step else ""),
-        "time": f"{outcome.seconds:.1f} s",
-        "speed": f"{outcome.step / max(outcome.seconds, 1e-9):.1f} steps/s",
-        "training": _losses(outcome.train),
-        "held out": _losses(outcome.validation),
-        "written to": str(run),
-    }
-    width = max(map(len, rows))
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
-
-
-def _losses(losses: Any) -> str:
-    return ", ".join(f"{name} {value:.4g}" for name, value in losses.items()) or "-"
-
-
-def _finish(options: TrainOptions[Any]) -> None:
-    """Draw the curves and say what comes next."""
-    run = options.folder
-    if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
-        logger.info("curves: %s", run / CURVES)
-    else:
-        logger.info("no picture of the curves: pip install matplotlib")
-    print(f"next: {rollout_line(options)}")  # noqa: T201
-
-
-def _open_log(options: TrainOptions[Any], start: Checkpoint | None) -> MetricsLog:
-    """Prepare the run folder and open what is written on the way."""
-    run = options.folder
-    remove_partial_checkpoints(run)
-    if start is None:
-        start_anew(run)
-        write_config(run, options.to_config())
-    elif not (run / CONFIG).is_file():
-        raise RequestError(f"'{run}' has lost its {CONFIG}; choose another --out")
-    step = start.step if start else 0
-    board = open_board(options.logger, run, step, options.to_config())
-    return MetricsLog(run / METRICS, step, board)
-
-
-def _announce(job: Job, parts: Parts, processes: Processes) -> None:
-    options, schedule, model = job.options, job.schedule, parts.train_step.model
-    by_episode = options.training.sampler == "episode"
-    lines = {
-        "preset": f"{options.preset}, seed {options.seed}",
-        "run folder": str(options.folder),
-        "episodes": f"{len(job.split.train)} to train on, {len(job.split.validation)} held out",
-        "budget": f"{schedule.epochs(job.total_steps):.4g} epochs x "
-        f"{schedule.frames_per_epoch} {'starts' if by_episode else 'frames'} = {job.total_steps} "
-        f"steps of {options.training.batch_size} = {job.total_frames} frames",
-        "device": describe_device(parts.train_step.device)
-        + (f", {processes.world_size} processes" if processes.world_size > 1 else "")
-        + f", precision {'bf16' if parts.train_step.autocast else 'fp32'}",
-        options.policy: f"{sum(p.numel() for p in model.parameters()):,} weights, "
-        f"{sum(p.numel() for p in model.parameters() if p.requires_grad):,} trained",
-    }
-    for name, text in lines.items():
-        logger.info("%s: %s", name, text)
-
-
-def main(args: Sequence[str]) -> int:
-    """Run ``bin/Train.py``."""
     prepare_pytorch()
-    return train(args)
+    config = parse_config(args)
+    from robo_manip_baselines.training.device import Processes
+    from robo_manip_baselines.training.trainer import train
+
+    before = list_checkpoints(config.folder)
+    code = train(config, resume="--resume" in args)
+    if not Processes.from_environment().is_main:
+        return code
+    out = shlex.quote(str(config.folder))
+    if code:
+        step, _ = list_checkpoints(config.folder)[-1]
+        resume = f"python bin/Train.py {config.policy} --out {out} --resume"
+        logger.info("stopped at step %d; continue with: %s", step, resume)
+        return code
+    print(summary(config, before[-1][0] if before else 0))  # noqa: T201
+    print(  # noqa: T201
+        f"next: python bin/Rollout.py {config.env} --policy {config.policy} --checkpoint {out}"
+    )
+    return 0

@@ -1,7 +1,13 @@
-"""Mean and standard deviation of what a policy sees and does, from its training episodes only."""
+"""Normalisation of states and actions, measured on the training episodes only.
+
+A normalisation is an offset and a scale for each element: x -> (x - offset) / scale. A policy names
+the function that measures them in its registry entry, one of ``METHODS`` or a ``module:function``
+of its own with the same signature.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -19,11 +25,13 @@ instead of being blown up to unit variance. 1 mm, 1 mrad; below what the task ca
 
 @dataclass(frozen=True)
 class Normalization:
-    """How vectors are scaled, for the S elements of a state and the A of an action.
+    """Offsets and scales for the S elements of a state and the A elements of an action.
+
+    The names are those of ``stats.json``; only `mean_std` makes them means and deviations.
 
     Attributes:
-        state_mean, state_std: (S,) float32.
-        action_mean, action_std: (A,) float32.
+        state_mean, state_std: (S,) float32, offset and scale of states.
+        action_mean, action_std: (A,) float32, offset and scale of actions.
     """
 
     state_mean: Vector
@@ -31,25 +39,20 @@ class Normalization:
     action_mean: Vector
     action_std: Vector
 
-    @classmethod
-    def of(cls, state: NDArray[np.float32], action: NDArray[np.float32]) -> Normalization:
-        """Measure (n, S) states and (n, A) actions, the rows of the training episodes."""
-        return cls(*_mean_std(state), *_mean_std(action))
-
-    def normalized_state(self, state: Vector) -> Vector:
+    def normalize_state(self, state: Vector) -> Vector:
         """Scale (..., S) states."""
         return (state - self.state_mean) / self.state_std
 
-    def normalized_action(self, action: Vector) -> Vector:
+    def normalize_action(self, action: Vector) -> Vector:
         """Scale (..., A) actions."""
         return (action - self.action_mean) / self.action_std
 
-    def action(self, normalized: Vector) -> Vector:
+    def unnormalize_action(self, normalized: Vector) -> Vector:
         """Scale (..., A) normalised actions back."""
         return normalized * self.action_std + self.action_mean
 
     def to_json(self) -> dict[str, list[float]]:
-        """Return what `from_json` takes, bit for bit, made of plain lists."""
+        """Return the vectors as plain lists, exactly."""
         return {field.name: getattr(self, field.name).tolist() for field in fields(self)}
 
     @classmethod
@@ -61,19 +64,53 @@ class Normalization:
                 another length, or a divisor is 0 or less.
         """
         vectors = {field.name: _vector(data, field.name) for field in fields(cls)}
-        for of in ("state", "action"):
-            mean, std = vectors[f"{of}_mean"], vectors[f"{of}_std"]
+        for kind in ("state", "action"):
+            mean, std = vectors[f"{kind}_mean"], vectors[f"{kind}_std"]
             if len(mean) != len(std):
-                raise RequestError(f"statistics: {len(mean)} of '{of}_mean', {len(std)} of its std")
+                raise RequestError(
+                    f"statistics: {len(mean)} of '{kind}_mean', {len(std)} of its std"
+                )
             if not (std > 0.0).all():
-                raise RequestError(f"statistics: '{of}_std' must be more than 0 everywhere")
+                raise RequestError(f"statistics: '{kind}_std' must be more than 0 everywhere")
         return cls(**vectors)
 
 
-def _mean_std(values: NDArray[np.float32]) -> tuple[Vector, Vector]:
-    wide = values.astype(np.float64)
-    std = np.maximum(wide.std(axis=0), SMALLEST_STD)
-    return wide.mean(axis=0).astype(np.float32), std.astype(np.float32)
+def mean_std(state: Vector, action: Vector) -> Normalization:
+    """Normalise (n, S) states and (n, A) actions to mean 0 and standard deviation 1."""
+
+    def measure(values: Vector) -> tuple[Vector, Vector]:
+        wide = values.astype(np.float64)
+        std = np.maximum(wide.std(axis=0), SMALLEST_STD)
+        return wide.mean(axis=0).astype(np.float32), std.astype(np.float32)
+
+    return Normalization(*measure(state), *measure(action))
+
+
+def min_max(state: Vector, action: Vector) -> Normalization:
+    """Normalise (n, S) states and (n, A) actions to the range [-1, 1]."""
+
+    def measure(values: Vector) -> tuple[Vector, Vector]:
+        low, high = values.min(axis=0), values.max(axis=0)
+        return (low + high) / 2, np.maximum((high - low) / 2, np.float32(SMALLEST_STD))
+
+    return Normalization(*measure(state), *measure(action))
+
+
+def no_normalization(state: Vector, action: Vector) -> Normalization:
+    """Leave (n, S) states and (n, A) actions in their own units."""
+
+    def measure(values: Vector) -> tuple[Vector, Vector]:
+        size = values.shape[1]
+        return np.zeros(size, np.float32), np.ones(size, np.float32)
+
+    return Normalization(*measure(state), *measure(action))
+
+
+METHODS: dict[str, Callable[[Vector, Vector], Normalization]] = {
+    "mean_std": mean_std,
+    "min_max": min_max,
+    "none": no_normalization,
+}
 
 
 def _vector(data: Any, name: str) -> Vector:

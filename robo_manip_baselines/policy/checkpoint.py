@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from robo_manip_baselines.data.demonstrations import Split
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
+from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims, TrainSettings
 from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
 from robo_manip_baselines.runs.checkpoints import (
     checkpoint_folder,
@@ -50,23 +50,23 @@ class Checkpoint:
     """A trained policy, without its weights.
 
     Attributes:
-        folder: where it is.
-        policy: name in ``POLICIES``.
+        folder: its folder.
+        policy: name of the policy in the registry.
         config: the policy's own frozen dataclass.
-        sizes: what the network was made for.
-        spec: what the policy was shown.
+        dims: dimensions of its inputs and outputs.
+        spec: its observations in training.
         env: name of the environment in ``ENVS``.
-        acting: how it was meant to act.
+        execution: default execution of its action chunks.
         normalization: of states and actions, from the training episodes.
         action_names: (A,) elements of an action.
         control_period: seconds between actions.
-        xml_hash: of the simulated model that the demonstrations were made in.
-        step: optimiser steps that made it.
+        xml_hash: of the simulated model that the demonstrations were recorded in.
+        step: optimiser steps done.
         train_seed: seed of the training run.
-        settings: how it was trained.
-        split: which episodes it was trained on, and which were held out.
+        settings: optimiser, sampling and budget of the training run.
+        split: training episodes and episodes held out.
         dataset: facts of the demonstrations: ``folder``, ``episodes`` (how many), ``content_hash``
-            and ``env_kwargs``, what their environment was made with beside ``spec``.
+            and ``env_kwargs``, arguments of their environment beside ``spec``.
         versions: of the libraries that wrote it.
         content_hash: SHA-256 over weights, configuration and statistics; 64 hexadecimal digits.
     """
@@ -74,10 +74,10 @@ class Checkpoint:
     folder: Path
     policy: str
     config: Any
-    sizes: Sizes
+    dims: PolicyDims
     spec: ObservationSpec
     env: str
-    acting: Acting
+    execution: ActionExecution
     normalization: Normalization
     action_names: tuple[str, ...]
     control_period: float
@@ -105,7 +105,19 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     config = read_json(verify(folder, digests, CONFIG))
     stats = read_json(verify(folder, digests, STATS))
     try:
-        return Checkpoint(folder=folder, **_decode(config, stats), content_hash=_hash(digests))
+        return Checkpoint(
+            folder=folder,
+            config=load_part(policy_entry(config["policy"]).config)(**_tuples(config["config"])),
+            dims=PolicyDims(**_tuples(config["sizes"])),
+            spec=ObservationSpec.from_json(config["spec"]),
+            execution=ActionExecution.from_json(config["acting"]),
+            normalization=Normalization.from_json(stats),
+            action_names=tuple(config["action_names"]),
+            settings=TrainSettings(**config["settings"]),
+            split=Split.from_json(config["split"]),
+            content_hash=_content_hash(digests),
+            **{name: config[name] for name in _UNCHANGED},
+        )
     except RequestError as error:
         raise RequestError(f"checkpoint '{folder}' does not fit this package: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
@@ -126,7 +138,7 @@ def load_model(checkpoint: Checkpoint, device: torch.device | str = "cpu") -> Po
     import safetensors.torch
 
     config = without_initial_weights(checkpoint.config)
-    model = make_model(checkpoint.policy, config, checkpoint.sizes)
+    model = make_model(checkpoint.policy, config, checkpoint.dims)
     state = safetensors.torch.load_file(checkpoint.folder / MODEL)
     try:
         model.load_state_dict(state)
@@ -138,9 +150,9 @@ def load_model(checkpoint: Checkpoint, device: torch.device | str = "cpu") -> Po
 
 
 def without_initial_weights(config: Any) -> Any:
-    """Return a policy's settings without the file that training began from.
+    """Return a policy's settings without the file of initial weights.
 
-    The weights of a checkpoint come from the checkpoint: the file need not be there any more.
+    The weights of a checkpoint come from the checkpoint: that file may be gone.
     """
     if getattr(config, INITIAL_WEIGHTS, None) is None:
         return config
@@ -158,28 +170,39 @@ def write_checkpoint(
 
     Args:
         folder: name of the folder, which must not exist yet.
-        checkpoint: what to say of the network; its ``folder`` and ``content_hash`` are not read.
-        model_state: the state dict that evaluation uses.
-        trainer_tensors: what training needs to go on, flat names.
-        trainer: the same, as JSON.
+        checkpoint: description of the network; its ``folder`` and ``content_hash`` are not read.
+        model_state: the state dict for evaluation.
+        trainer_tensors: tensors for resuming, flat names.
+        trainer: numbers for resuming, for JSON.
 
     Returns:
         The checkpoint, with its folder and hash.
     """
     import safetensors.torch
 
-    config, stats = _encode(checkpoint)
+    config = {
+        **{name: getattr(checkpoint, name) for name in _UNCHANGED},
+        "config": dataclasses.asdict(checkpoint.config),
+        "action_names": list(checkpoint.action_names),
+        "split": checkpoint.split.to_json(),
+        # Named as in the first release.
+        "sizes": dataclasses.asdict(checkpoint.dims),
+        "spec": checkpoint.spec.to_json(),
+        "acting": checkpoint.execution.to_json(),
+        "settings": dataclasses.asdict(checkpoint.settings),
+    }
     with checkpoint_folder(folder) as temporary:
         safetensors.torch.save_file(_on_cpu(model_state), temporary / MODEL)
         safetensors.torch.save_file(_on_cpu(trainer_tensors), temporary / TRAINER_TENSORS)
         write_json(temporary / CONFIG, config)
-        write_json(temporary / STATS, stats)
+        write_json(temporary / STATS, checkpoint.normalization.to_json())
         write_json(temporary / TRAINER, trainer)
-    return dataclasses.replace(checkpoint, folder=folder, content_hash=_hash(read_manifest(folder)))
+    content_hash = _content_hash(read_manifest(folder))
+    return dataclasses.replace(checkpoint, folder=folder, content_hash=content_hash)
 
 
 def read_trainer(checkpoint: Checkpoint) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what training needs to go on, verified: tensors by name, and JSON.
+    """Read the trainer's state, verified: tensors by name, and JSON.
 
     Raises:
         RequestError: it is missing or damaged.
@@ -191,6 +214,19 @@ def read_trainer(checkpoint: Checkpoint) -> tuple[dict[str, Tensor], dict[str, A
     return tensors, read_json(verify(checkpoint.folder, digests, TRAINER))
 
 
+_UNCHANGED = (
+    "policy",
+    "env",
+    "control_period",
+    "xml_hash",
+    "step",
+    "train_seed",
+    "dataset",
+    "versions",
+)
+"""Attributes that are in ``config.json`` as they are."""
+
+
 def _on_cpu(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Copies: safetensors takes neither shared memory nor other layouts than row by row."""
     return {
@@ -198,49 +234,13 @@ def _on_cpu(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _hash(digests: Mapping[str, str]) -> str:
-    """Digest of what makes the policy act as it does: the trainer's state may be deleted."""
+def _content_hash(digests: Mapping[str, str]) -> str:
+    """Digest of the files that decide the policy's actions: the trainer's state may be deleted."""
     text = "".join(f"{name} {digests[name]}\n" for name in (MODEL, CONFIG, STATS))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-_DATACLASSES = {
-    "sizes": Sizes,
-    "spec": ObservationSpec,
-    "acting": Acting,
-    "settings": TrainSettings,
-}
-_PLAIN = ("policy", "env", "control_period", "xml_hash", "step", "train_seed")
-_DICTS = ("dataset", "versions")
-
-
-def _encode(checkpoint: Checkpoint) -> tuple[dict[str, Any], dict[str, Any]]:
-    config: dict[str, Any] = {name: getattr(checkpoint, name) for name in (*_PLAIN, *_DICTS)}
-    config["config"] = dataclasses.asdict(checkpoint.config)
-    config["action_names"] = list(checkpoint.action_names)
-    config["split"] = checkpoint.split.to_json()
-    for name in _DATACLASSES:
-        value = getattr(checkpoint, name)
-        config[name] = value.to_json() if name == "spec" else dataclasses.asdict(value)
-    return config, checkpoint.normalization.to_json()
-
-
-def _decode(config: dict[str, Any], stats: dict[str, Any]) -> dict[str, Any]:
-    decoded: dict[str, Any] = {name: config[name] for name in (*_PLAIN, *_DICTS)}
-    for name, kind in _DATACLASSES.items():
-        values = config[name]
-        decoded[name] = (
-            kind.from_json(values) if kind is ObservationSpec else kind(**_with_tuples(values))
-        )
-    policy_config = load_part(policy_entry(config["policy"]).config)
-    decoded["config"] = policy_config(**_with_tuples(config["config"]))
-    decoded["action_names"] = tuple(config["action_names"])
-    decoded["split"] = Split.from_json(config["split"])
-    decoded["normalization"] = Normalization.from_json(stats)
-    return decoded
-
-
-def _with_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
     }

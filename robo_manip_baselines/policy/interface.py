@@ -1,7 +1,7 @@
-"""What every policy's network is to training and to evaluation.
+"""Interface between a policy's network, its training and its evaluation.
 
-Legend: B batch, S elements of all observed vectors together, N cameras, H and W image height and
-width, K actions of a chunk, A elements of an action, Z numbers of noise.
+Legend: B batch, O observation steps, S elements of all observed vectors together, N cameras, H and
+W image height and width, K actions of a chunk, A elements of an action, Z elements of noise.
 """
 
 from __future__ import annotations
@@ -11,26 +11,27 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from robo_manip_baselines.policy.presets import Sizes
+from robo_manip_baselines.policy.presets import PolicyDims
 
-__all__ = ["Batch", "PolicyModel", "Sizes", "masked_mean"]
+__all__ = ["Batch", "PolicyDims", "PolicyModel", "masked_mean"]
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What one training step sees, on the device of the network.
+    """Examples of one training step, on the device of the network.
 
     Attributes:
-        state: (B, S) float32, normalised.
-        images: (B, N, H, W, 3) uint8 as they are in the files, or None without cameras.
+        state: (B, O, S) float32, normalised; the last of the O steps is the present one, and steps
+            before the start of the episode repeat its first.
+        images: (B, O, N, H, W, 3) uint8 of the same steps, or None without cameras.
         action: (B, K, A) float32, normalised; anything where ``is_pad``.
         is_pad: (B, K) bool, True for steps after the end of the episode.
-        noise: (B, Z) float32, standard normal, Z as the network's ``noise_size`` asks.
+        noise: (B, Z) float32, standard normal, Z being the network's ``noise_size``.
         num_valid: () float32, steps of the whole batch that are not padding, divided by the number
             of processes that share the batch: a process that divides its sum by this number gets
             gradients whose average over the processes is the gradient of the whole batch's mean.
         num_examples: () float32, examples of the whole batch divided by the number of processes,
-            to be used likewise by what is averaged over examples.
+            to be used likewise for averages over examples.
     """
 
     state: Tensor
@@ -43,32 +44,45 @@ class Batch:
 
 
 class PolicyModel(nn.Module):
-    """A network that predicts a chunk of actions.
+    """A network that predicts a chunk of actions from a window of observations.
 
-    Training draws all randomness but dropout for it (``Batch.noise``), so that ``loss`` is a
-    function of the batch and of the parameters.
+    All randomness but dropout is drawn outside (``Batch.noise``, the noise of `predict`), so that
+    ``loss`` and ``predict`` are functions of their arguments and of the parameters.
+
+    Attributes:
+        chunk_size: K, actions that `predict` returns.
+        n_obs_steps: O, steps of the window, the present one included.
+        noise_size: Z, elements of noise that `loss` needs for each example.
+        sample_noise_size: Z, elements of noise that `predict` needs for each example.
     """
 
     chunk_size: int
-    """K, actions that ``predict`` returns."""
-
+    n_obs_steps: int = 1
     noise_size: int = 0
-    """Z, numbers of noise that ``loss`` needs for each example."""
+    sample_noise_size: int = 0
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss``, the scalar to minimise, and its parts by name, all float32 scalars."""
         raise NotImplementedError
 
-    def predict(self, state: Tensor, images: Tensor | None) -> Tensor:
-        """Return normalised actions (B, K, A) float32 for states (B, S), images (B, N, H, W, 3)."""
+    def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
+        """Return normalised actions (B, K, A) float32.
+
+        Args:
+            state: (B, O, S) float32, normalised.
+            images: (B, O, N, H, W, 3) uint8; None without cameras.
+            noise: (B, Z) float32, standard normal; None where ``sample_noise_size`` is 0. A row is
+                a function of the episode's seed and of the control step, so that sampled actions
+                do not depend on the number of environments.
+        """
         raise NotImplementedError
 
     def for_inference(self, dtype: torch.dtype) -> PolicyModel:
         """Return a network that only predicts; this one, unless a policy knows a faster form.
 
         Args:
-            dtype: of the matrix products, ``torch.float32`` or ``torch.bfloat16``; who overrides
-                this needs no autocast.
+            dtype: of the matrix products, ``torch.float32`` or ``torch.bfloat16``; a policy that
+                overrides this is run without autocast.
         """
         return self
 

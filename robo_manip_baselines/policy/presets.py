@@ -1,17 +1,50 @@
-"""What a network must fit. Nothing heavy is imported here."""
+"""Settings that every policy has in common: dimensions, training, action execution, presets.
+
+Nothing heavy is imported here, so that ``--help`` needs no PyTorch.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
+SAMPLERS = ("episode", "frame")
+PRECISIONS = ("auto", "fp32", "bf16")
+SCHEDULES = ("constant", "cosine")
+
+
+def require_at_least(least: float, config: Any, *names: str) -> None:
+    """Require attributes of a configuration to be None, or finite and ``least`` or more.
+
+    Raises:
+        RequestError: naming the first that is not.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and not least <= value < math.inf:
+            finite = ", and finite" if isinstance(value, float) else ""
+            raise RequestError(f"{name} {value}: must be {least} or more{finite}")
+
+
+def require_proportion(config: Any, *names: str) -> None:
+    """Require attributes of a configuration to be 0 or more and less than 1.
+
+    Raises:
+        RequestError: naming the first that is not.
+    """
+    for name in names:
+        if not 0.0 <= getattr(config, name) < 1.0:
+            raise RequestError(f"{name} {getattr(config, name)}: must be 0 or more, less than 1")
+
 
 @dataclass(frozen=True)
-class Sizes:
-    """What a network must fit.
+class PolicyDims:
+    """Dimensions of a policy's inputs and outputs.
 
     Attributes:
         state: S, elements of all observed vectors together.
@@ -24,11 +57,6 @@ class Sizes:
     action: int
     cameras: int
     image: tuple[int, int]
-
-
-SAMPLERS = ("episode", "frame")
-PRECISIONS = ("auto", "fp32", "bf16")
-SCHEDULES = ("constant", "cosine")
 
 
 @dataclass(frozen=True)
@@ -44,16 +72,16 @@ class TrainSettings:
         clip_norm: largest norm of the gradient; 0 for no clipping.
         sampler: ``episode``: an epoch draws one start from each episode (paper); ``frame``: an
             epoch visits every frame once.
-        epochs: budget in epochs; None where ``steps`` says it.
-        steps: budget in optimiser steps; None where ``epochs`` says it.
-        state_noise: standard deviation of the Gaussian noise that is added, in training, to what
-            the robot feels of itself (joints, gripper), in units of each element's own; 0 for
-            none. Scripted demonstrations never leave their path: without noise a policy learns to
-            read the next target off the last one, and is lost where no demonstration has been.
-        clock_noise: likewise for the time since the start that ``current_pred`` shows, the same
-            for all its frames. With a clock to go by, a policy lets go by the clock, whether or
+        epochs: budget in epochs; None where ``steps`` gives it.
+        steps: budget in optimiser steps; None where ``epochs`` gives it.
+        state_noise: standard deviation of the Gaussian noise that is added, in training, to the
+            proprioceptive part of the state (joints, gripper), in units of each element's own; 0
+            for none. Scripted demonstrations never leave their path: without noise a policy learns
+            to read the next target off the last one, and fails where no demonstration has been.
+        clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
+            for all its frames. A policy that can read the clock releases by the clock, whether or
             not it has reached the mouth.
-        validation_fraction: share of the episodes that is held out (public ACT: 0.2).
+        validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
         precision: ``fp32``, ``bf16`` (autocast; losses and norms stay fp32), or ``auto``.
@@ -85,64 +113,70 @@ class TrainSettings:
         require_choice("schedule", self.schedule, SCHEDULES)
         if (self.epochs is None) == (self.steps is None):
             raise RequestError("give the budget as --epochs or as --steps, one of the two")
-        for name in ("batch_size", "epochs", "steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise RequestError(f"{name} {value}: must be 1 or more")
+        require_at_least(1, self, "batch_size", "epochs", "steps")
         if not self.learning_rate > 0.0:
             raise RequestError(f"learning_rate {self.learning_rate}: must be more than 0")
-        for name in ("weight_decay", "warmup_steps", "clip_norm", "state_noise", "clock_noise"):
-            if getattr(self, name) < 0:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more")
-        for name in ("validation_fraction", "ema_decay"):
-            if not 0.0 <= getattr(self, name) < 1.0:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more, less than 1")
+        require_at_least(0, self, "weight_decay", "warmup_steps", "clip_norm")
+        require_at_least(0, self, "state_noise", "clock_noise")
+        require_proportion(self, "validation_fraction", "ema_decay")
 
 
 @dataclass(frozen=True)
-class Acting:
-    """How chunks of actions become actions.
+class ActionExecution:
+    """Execution of predicted action chunks.
 
     Attributes:
-        temporal_ensemble: ask the network at every step and average all its predictions for that
-            step; otherwise carry out the beginning of a chunk before the next is asked for.
-        decay: k in the weights exp(-k i) of the ensemble, i = 0 for the oldest prediction (public
-            ACT: 0.01).
-        execute: actions of a chunk that are carried out, without the ensemble.
+        temporal_ensemble: predict a chunk at every step and average all predictions for that step;
+            otherwise execute the beginning of a chunk before the next is predicted.
+        ensemble_decay: k in the weights exp(-k i) of the ensemble, i = 0 for the oldest prediction
+            (public ACT: 0.01).
+        n_action_steps: actions of a chunk that are executed, without the ensemble.
 
     Raises:
         RequestError: a value that is not valid.
     """
 
     temporal_ensemble: bool = True
-    decay: float = 0.01
-    execute: int = 1
+    ensemble_decay: float = 0.01
+    n_action_steps: int = 1
 
     def __post_init__(self) -> None:
-        if self.execute < 1:
-            raise RequestError(f"execute {self.execute}: must be 1 or more actions")
+        require_at_least(1, self, "n_action_steps")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all settings under the names that checkpoints have had since the first release."""
+        return {
+            "temporal_ensemble": self.temporal_ensemble,
+            "decay": self.ensemble_decay,
+            "execute": self.n_action_steps,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> ActionExecution:
+        """Undo `to_json`."""
+        return cls(values["temporal_ensemble"], values["decay"], values["execute"])
 
 
 @dataclass(frozen=True)
 class PolicyPreset:
-    """One named set of choices; whoever trains may override each of them.
+    """A named set of defaults for training a policy; each can be overridden.
 
     Attributes:
         config: the policy's own frozen dataclass.
         training: optimiser, sampling and budget.
-        cameras, image_size, object_pose: what is shown beside the robot and the mouth.
-        acting: how chunks become actions.
+        execution: execution of the predicted action chunks.
+        cameras, image_size, object_pose: observed beside the robot and the mouth.
     """
 
     config: Any
     training: TrainSettings
-    acting: Acting
+    execution: ActionExecution
     cameras: tuple[str, ...] = CAMERAS
     image_size: tuple[int, int] = (480, 640)
     object_pose: bool = False
 
 
-WITHOUT_IMAGES = TrainSettings(
+STATE_ONLY_TRAINING = TrainSettings(
     batch_size=64,
     learning_rate=1e-3,
     schedule="cosine",
@@ -154,5 +188,4 @@ WITHOUT_IMAGES = TrainSettings(
     validation_fraction=0.0,
     ema_decay=0.999,
 )
-"""How policies are trained that see no images, in minutes on two cores; ``docs/act.md`` says what
-was tried."""
+"""Training of policies without images, minutes on two cores; ``docs/act.md`` has the ablations."""

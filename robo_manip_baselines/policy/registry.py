@@ -1,34 +1,45 @@
-"""Which policies there are. Adding one is a folder and a line here.
+"""Registry of policies: those of this package, and those that other packages register.
 
-Importing this module imports no network: classes are named, and loaded when they are asked for.
+A policy of this package is a folder beside this module and a line of ``POLICIES``. Another package
+registers one by an entry point of the group ``robo_manip_baselines.policies``: its name is the
+policy's name, its value the place of a `PolicyEntry` (``"my_package.policy:ENTRY"``).
+
+Importing this module imports no network: classes are named, and loaded when they are needed.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
-from robo_manip_baselines.runs.errors import require_choice
+from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 if TYPE_CHECKING:
     from robo_manip_baselines.policy.interface import PolicyModel
-    from robo_manip_baselines.policy.presets import Sizes
+    from robo_manip_baselines.policy.presets import PolicyDims, PolicyPreset
+
+ENTRY_POINT_GROUP = "robo_manip_baselines.policies"
 
 
 @dataclass(frozen=True)
 class PolicyEntry:
-    """Where the parts of a policy are.
+    """Places of the parts of a policy.
 
     Attributes:
         config: ``module:class`` of its frozen dataclass of settings.
-        model: ``module:class`` of its ``PolicyModel``, made as ``Model(config, sizes)``.
-        presets: ``module:name`` of a dict: preset -> ``PolicyPreset``.
+        model: ``module:class`` of its ``PolicyModel``, built as ``Model(config, dims)``.
+        presets: ``module:name`` of a dict: preset -> ``PolicyPreset``, the first of which is the
+            default where none fits the machine.
+        normalization: of its states and actions: ``mean_std``, ``min_max`` (to [-1, 1]), ``none``,
+            or ``module:function`` of its own; see `data.normalization`.
     """
 
     config: str
     model: str
     presets: str
+    normalization: str = "mean_std"
 
 
 POLICIES: dict[str, PolicyEntry] = {
@@ -45,25 +56,44 @@ POLICIES: dict[str, PolicyEntry] = {
 }
 
 
+def policy_names() -> list[str]:
+    """Return the names of all policies, those of this package first."""
+    others = entry_points(group=ENTRY_POINT_GROUP).names
+    return [*POLICIES, *sorted(others - POLICIES.keys())]
+
+
 def policy_entry(name: str) -> PolicyEntry:
-    """Return the entry of a policy.
+    """Return the entry of a policy, importing the package that registers it if need be.
+
+    Raises:
+        RequestError: there is no such policy, or its entry point refers to something else.
+    """
+    require_choice("policy", name, policy_names())
+    if name in POLICIES:
+        return POLICIES[name]
+    (point, *_) = entry_points(group=ENTRY_POINT_GROUP, name=name)
+    try:
+        entry = point.load()
+    except (ImportError, AttributeError) as error:
+        raise RequestError(f"policy '{name}': cannot load '{point.value}': {error}") from error
+    if not isinstance(entry, PolicyEntry):
+        raise RequestError(f"policy '{name}': '{point.value}' is no PolicyEntry")
+    return entry
+
+
+def policy_presets(name: str) -> dict[str, PolicyPreset]:
+    """Return the presets of a policy by name.
 
     Raises:
         RequestError: there is no such policy.
     """
-    return POLICIES[require_choice("policy", name, POLICIES)]
+    return load_part(policy_entry(name).presets)
 
 
-def load_part(reference: str) -> Any:
-    """Import what ``module:name`` refers to."""
-    module, _, name = reference.partition(":")
-    return getattr(import_module(module), name)
-
-
-def make_model(name: str, config: Any, sizes: Sizes) -> PolicyModel:
+def make_model(name: str, config: Any, dims: PolicyDims) -> PolicyModel:
     """Build the network of a policy, freshly initialised.
 
     Raises:
-        RequestError: there is no such policy, or its settings do not fit the sizes.
+        RequestError: there is no such policy, or its settings do not fit the dimensions.
     """
-    return load_part(policy_entry(name).model)(config, sizes)
+    return load_part(policy_entry(name).model)(config, dims)

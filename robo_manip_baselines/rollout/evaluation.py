@@ -18,7 +18,7 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model, read_checkpoint
-from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.rollout.results import (
     SUMMARY,
     EpisodeResult,
@@ -144,7 +144,7 @@ class EvaluationPlan:
     config: EvaluationConfig
     checkpoint: Checkpoint
     env: EnvConfig
-    execution: Acting
+    execution: ActionExecution
     out: Path
     device: torch.device
 
@@ -158,10 +158,10 @@ class EvaluationPlan:
         checkpoint = read_checkpoint(config.checkpoint)
         prepare_pytorch()
         # Imported here: a request that is wrong so far is refused without waiting for PyTorch.
-        from robo_manip_baselines.policy.execution import PRECISIONS
+        from robo_manip_baselines.policy.execution import INFERENCE_PRECISIONS
         from robo_manip_baselines.training.device import choose_device
 
-        require_choice("precision", config.precision, PRECISIONS)
+        require_choice("precision", config.precision, INFERENCE_PRECISIONS)
         spec = checkpoint.spec
         if config.corruption is not None:
             spec = replace(spec, corruption=config.corruption.pinned())
@@ -178,7 +178,7 @@ class EvaluationPlan:
             checkpoint=checkpoint,
             env=env,
             execution=choose_execution(
-                checkpoint.acting, config.temporal_ensemble, config.n_action_steps
+                checkpoint.execution, config.temporal_ensemble, config.n_action_steps
             ),
             out=config.out or out,
             device=choose_device(config.device),
@@ -187,9 +187,9 @@ class EvaluationPlan:
     def __str__(self) -> str:
         execution, checkpoint, seeds = self.execution, self.checkpoint, self.config.seeds
         how = (
-            f"temporal ensemble (decay {execution.decay:g})"
+            f"temporal ensemble (decay {execution.ensemble_decay:g})"
             if execution.temporal_ensemble
-            else f"{execution.execute} actions of each chunk"
+            else f"{execution.n_action_steps} actions of each chunk"
         )
         return (
             f"{checkpoint.policy}, {self.condition}, step {checkpoint.step}, on "
@@ -230,15 +230,15 @@ class EvaluationPlan:
 
     def make_policy(self, num_envs: int) -> ActingPolicy:
         """Load the network and make it act in so many environments."""
-        from robo_manip_baselines.policy.execution import ChunkPolicy
+        from robo_manip_baselines.policy.execution import PolicyRunner
 
         checkpoint = self.checkpoint
-        return ChunkPolicy(
+        return PolicyRunner(
             load_model(checkpoint, self.device),
             checkpoint.spec,
             checkpoint.normalization,
             self.execution,
-            slots=num_envs,
+            num_envs=num_envs,
             device=self.device,
             precision=self.config.precision,
         )
@@ -350,11 +350,11 @@ def run_plan(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
 
 
 def choose_execution(
-    trained: Acting, temporal_ensemble: bool, n_action_steps: int | None
-) -> Acting:
+    trained: ActionExecution, temporal_ensemble: bool, n_action_steps: int | None
+) -> ActionExecution:
     """Return the action execution of a checkpoint with the given changes."""
     if n_action_steps is not None:
-        return replace(trained, temporal_ensemble=False, execute=n_action_steps)
+        return replace(trained, temporal_ensemble=False, n_action_steps=n_action_steps)
     return replace(trained, temporal_ensemble=True) if temporal_ensemble else trained
 
 
@@ -374,11 +374,11 @@ def _corruption_suffix(checkpoint: Checkpoint, env: EnvConfig) -> str:
     return f"_under_{corruption.label or 'truth'}"
 
 
-def _effective(execution: Acting) -> dict[str, Any]:
+def _effective(execution: ActionExecution) -> dict[str, Any]:
     """Return the settings that make a difference, in the names of ``evaluation.json``."""
     if execution.temporal_ensemble:
-        return {"temporal_ensemble": True, "decay": execution.decay}
-    return {"temporal_ensemble": False, "execute": execution.execute}
+        return {"temporal_ensemble": True, "decay": execution.ensemble_decay}
+    return {"temporal_ensemble": False, "execute": execution.n_action_steps}
 
 
 def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> None:
@@ -392,7 +392,7 @@ def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> None:
         pairs = {
             "actions": (", ".join(checkpoint.action_names), ", ".join(world.action_names)),
             "control period": (checkpoint.control_period, CONTROL_PERIOD),
-            "size of the state": (checkpoint.sizes.state, config.vector_size),
+            "size of the state": (checkpoint.dims.state, config.vector_size),
             "model hash": (checkpoint.xml_hash[:12], world.xml_hash[:12]),
         }
     for name, (trained, here) in pairs.items():

@@ -1,7 +1,7 @@
-"""Where vectors and images lie, and how a batch of them comes to the device.
+"""Training batches: made ahead by threads, in main memory or on a CUDA device.
 
-Legend: R steps of the episodes that are loaded, b examples, S elements of the state, A elements
-of an action, K actions of a chunk, N cameras, H and W image height and width, Z numbers of noise.
+Legend: R steps of the training episodes, b examples, O observation steps, S elements of the state,
+A elements of an action, K actions of a chunk, N cameras, H and W image height and width.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -19,211 +19,52 @@ from torch import Tensor
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.policy.interface import Batch
+from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.training.images import FrameSource
-from robo_manip_baselines.training.sampling import Schedule, StateNoise, chunk_rows, noise_of
-
-Vectors = NDArray[np.float32]
+from robo_manip_baselines.training.images import ImageStore
+from robo_manip_baselines.training.sampling import (
+    ExampleSampler,
+    StateNoise,
+    chunk_rows,
+    step_noise,
+    window_rows,
+)
 
 UPLOAD = 64
-"""Steps whose images are copied at a time to where they are kept: 177 MB with three of 480x640."""
-
-
-@dataclass(frozen=True)
-class Examples:
-    """What a batch shall hold.
-
-    Attributes:
-        rows: (b, K) int64, places among the R steps of the actions; the first of each is that of
-            state and images.
-        is_pad: (b, K) bool, whether each is padding.
-        noise: (b, Z) float32.
-        state_noise: (b, S) float32 to add to the normalised state; None for nothing.
-        num_valid, num_examples: as in `Batch`.
-    """
-
-    rows: NDArray[np.int64]
-    is_pad: NDArray[np.bool_]
-    noise: Tensor
-    state_noise: Tensor | None
-    num_valid: float
-    num_examples: float
-
-
-@dataclass(frozen=True)
-class Gathered:
-    """A batch, and the event after which it may be read; None if at once."""
-
-    batch: Batch
-    ready: torch.cuda.Event | None = None
-
-
-class CpuTables:
-    """Gathers in main memory.
-
-    NumPy gathers, not torch: for so little data torch's threads take longer to meet than to work,
-    much longer on a busy machine.
-
-    Args:
-        state: (R, S), normalised.
-        action: (R, A), normalised.
-        rows: (R,), the rows of ``frames`` that these are.
-        frames: where images come from, if any.
-    """
-
-    def __init__(
-        self, state: Vectors, action: Vectors, rows: NDArray[np.int64], frames: FrameSource | None
-    ) -> None:
-        self._state = state
-        self._action = action
-        self._rows = rows
-        self._frames = frames
-
-    def gather(self, examples: Examples) -> Gathered:
-        """Return the batch."""
-        first = examples.rows[:, 0]
-        state = torch.from_numpy(self._state[first])
-        if examples.state_noise is not None:
-            state += examples.state_noise
-        images: Tensor | None = None
-        if self._frames is not None:
-            images = torch.from_numpy(self._frames.images(self._rows[first]))
-        return Gathered(
-            Batch(
-                state=state,
-                images=images,
-                action=torch.from_numpy(self._action[examples.rows]),
-                is_pad=torch.from_numpy(examples.is_pad),
-                noise=examples.noise,
-                num_valid=torch.tensor(examples.num_valid),
-                num_examples=torch.tensor(examples.num_examples),
-            )
-        )
-
-
-class CudaTables:
-    """Gathers on a CUDA device, on a stream of its own, without waiting for the device.
-
-    The vectors are kept there. So are the images, if `FrameSource` holds them and they take at
-    most half of the device's free memory; others are copied, batch by batch, from page-locked
-    memory.
-
-    Args:
-        device: where.
-        state: (R, S), normalised.
-        action: (R, A), normalised.
-        rows: (R,), the rows of ``frames`` that these are.
-        frames: where images come from, if any.
-    """
-
-    def __init__(
-        self,
-        device: torch.device,
-        state: Vectors,
-        action: Vectors,
-        rows: NDArray[np.int64],
-        frames: FrameSource | None,
-    ) -> None:
-        self._stream = torch.cuda.Stream(device)
-        self._rows = rows
-        self._frames = frames
-        self._images: Tensor | None = None
-        with torch.cuda.stream(self._stream):
-            self._state = torch.from_numpy(state).to(device)
-            self._action = torch.from_numpy(action).to(device)
-            if frames is not None and frames.held is not None:
-                self._images = self._on_device(frames, device)
-
-    def gather(self, examples: Examples) -> Gathered:
-        """Return the batch, which is ready when its event has come to pass."""
-        host_images: Tensor | None = None
-        if self._frames is not None and self._images is None:
-            shape = (len(examples.rows), *self._frames.shape)
-            host_images = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
-            self._frames.images(self._rows[examples.rows[:, 0]], out=host_images.numpy())
-        with torch.cuda.stream(self._stream):
-            rows = self._copied(torch.from_numpy(examples.rows))
-            images = None if self._images is None else self._images[rows[:, 0]]
-            if host_images is not None:
-                images = host_images.to(self._state.device, non_blocking=True)
-            state = self._state[rows[:, 0]]
-            if examples.state_noise is not None:
-                state += self._copied(examples.state_noise)
-            batch = Batch(
-                state=state,
-                images=images,
-                action=self._action[rows],
-                is_pad=self._copied(torch.from_numpy(examples.is_pad)),
-                noise=self._copied(examples.noise),
-                num_valid=self._copied(torch.tensor(examples.num_valid)),
-                num_examples=self._copied(torch.tensor(examples.num_examples)),
-            )
-            ready = torch.cuda.Event()
-            ready.record(self._stream)
-        return Gathered(batch, ready)
-
-    def _on_device(self, frames: FrameSource, device: torch.device) -> Tensor | None:
-        """Return the images (R, N, H, W, 3) of all rows; None if they are too many."""
-        shape = (len(self._rows), *frames.shape)
-        if math.prod(shape) > torch.cuda.mem_get_info(device)[0] // 2:
-            return None
-        images = torch.empty(shape, dtype=torch.uint8, device=device)
-        for first in range(0, len(self._rows), UPLOAD):
-            part = self._rows[first : first + UPLOAD]
-            images[first : first + len(part)] = torch.from_numpy(frames.images(part))
-        return images
-
-    def _copied(self, tensor: Tensor) -> Tensor:
-        return tensor.pin_memory().to(self._state.device, non_blocking=True)
-
-
-def received(gathered: Gathered) -> Batch:
-    """Make the current stream, of the thread that uses the batch, wait until the batch is there."""
-    if gathered.ready is not None:
-        stream = torch.cuda.current_stream(gathered.batch.state.device)
-        stream.wait_event(gathered.ready)
-        for field in fields(gathered.batch):
-            tensor = getattr(gathered.batch, field.name)
-            if tensor is not None:
-                # Its memory was got for another stream; it must not be used anew before this
-                # stream is done with it.
-                tensor.record_stream(stream)
-    return gathered.batch
-
+"""Steps whose images are copied to a GPU at a time: 177 MB with three of 480x640."""
 
 WORKERS = 2
 """Batches made at a time: while the last images of one are decoded, the next has begun."""
 
 
 def part_of(count: int, rank: int, world_size: int) -> slice:
-    """Return which of ``count`` examples are a process's: contiguous, as equal as can be."""
+    """Return a process's part of ``count`` examples: contiguous, as equal as can be."""
     return slice(count * rank // world_size, count * (rank + 1) // world_size)
 
 
 class BatchLoader:
-    """Makes the batches of a schedule, each a function of the seed and of the step.
+    """Batches of a sampler, each a function of the seed and of the step.
 
     Threads make batches while earlier steps are computed. On CUDA the vectors, and the images if
-    they fit, are on the device and gathered there; otherwise images are copied from page-locked
-    memory. Both happen on a stream of their own. Because the threads use the device, a CUDA graph
-    that is captured meanwhile needs ``capture_error_mode="thread_local"``.
+    `ImageStore` holds them and they take at most half of the device's free memory, are on the
+    device and gathered there; other images are copied from page-locked memory. Both happen on a
+    stream of their own. Because the threads use the device, a CUDA graph that is captured
+    meanwhile needs ``capture_error_mode="thread_local"``.
 
     Each process takes a contiguous part of every batch, as equal as can be.
 
     Args:
         demonstrations: all episodes.
-        normalization: how to scale vectors, measured on the training episodes.
-        episodes: indices into ``demonstrations`` of the episodes that ``schedule`` speaks of.
-        schedule: which examples each step sees.
-        chunk_size: K.
-        noise_size: Z.
+        normalization: of states and actions.
+        episodes: indices into ``demonstrations`` of the episodes of ``sampler``.
+        sampler: of the examples of each step.
+        model: only its chunk size, observation steps and noise size are read.
         seed: of the noise.
-        device: where batches go.
+        device: of the batches.
         rank: number of this process, from 0 on.
         world_size: processes that share each batch.
-        state_noise: what is added to states; nothing if None.
-        frames: where images come from; None without cameras. Not closed by the loader.
+        state_noise: added to states; None for no noise.
+        images: None without cameras. Not closed by the loader.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
     Raises:
@@ -236,51 +77,50 @@ class BatchLoader:
         demonstrations: Demonstrations,
         normalization: Normalization,
         episodes: Sequence[int],
-        schedule: Schedule,
+        sampler: ExampleSampler,
+        model: PolicyModel,
         *,
-        chunk_size: int,
-        noise_size: int,
         seed: int,
         device: torch.device | str,
         rank: int = 0,
         world_size: int = 1,
         state_noise: StateNoise | None = None,
-        frames: FrameSource | None = None,
+        images: ImageStore | None = None,
         depth: int = 4,
     ) -> None:
-        if not np.array_equal(demonstrations.lengths[list(episodes)], schedule.lengths):
-            raise ValueError("the schedule is of other episodes than the loader's")
-        if bool(demonstrations.spec.cameras) != (frames is not None):
-            raise ValueError("frames must be given if, and only if, there are cameras")
+        if not np.array_equal(demonstrations.lengths[list(episodes)], sampler.lengths):
+            raise ValueError("the sampler is of other episodes than the loader's")
+        if bool(demonstrations.spec.cameras) != (images is not None):
+            raise ValueError("images must be given if, and only if, there are cameras")
         if not 0 <= rank < world_size:
             raise ValueError(f"rank {rank} of {world_size} processes")
-        if world_size > schedule.batch_size:
+        if world_size > sampler.batch_size:
             raise RequestError(
-                f"batch_size {schedule.batch_size}: must be at least the {world_size} processes"
+                f"batch_size {sampler.batch_size}: must be at least the {world_size} processes"
             )
         if depth < 0:
             raise ValueError(f"depth {depth}: must be 0 or more")
-        self._schedule = schedule
-        self._offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(schedule.lengths)])
-        self._chunk_size = chunk_size
-        self._noise_size = noise_size
-        self._seed = seed
-        self._state_noise = state_noise or StateNoise(demonstrations.spec)
-        self._rank, self._world_size = rank, world_size
-        self._depth = depth
-        rows = demonstrations.rows(episodes)
-        state = normalization.normalized_state(demonstrations.state[rows])
-        action = normalization.normalized_action(demonstrations.action[rows])
-        device = torch.device(device)
-        self._tables = (
-            CudaTables(device, state, action, rows, frames)
-            if device.type == "cuda"
-            else CpuTables(state, action, rows, frames)
-        )
+        self._sampler, self._model, self._seed = sampler, model, seed
+        self._state_noise = state_noise
+        self._rank, self._world_size, self._depth = rank, world_size, depth
+        self._offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sampler.lengths)])
+        self._rows = demonstrations.rows(episodes)  # of the images, for each of the R steps
+        self._state = normalization.normalize_state(demonstrations.state[self._rows])
+        self._action = normalization.normalize_action(demonstrations.action[self._rows])
+        self._images = images
+        self._device = torch.device(device)
+        self._stream: torch.cuda.Stream | None = None
+        self._device_images: Tensor | None = None
+        if self._device.type == "cuda":
+            self._stream = torch.cuda.Stream(self._device)
+            with torch.cuda.stream(self._stream):
+                self._device_state = torch.from_numpy(self._state).to(self._device)
+                self._device_action = torch.from_numpy(self._action).to(self._device)
+                self._device_images = self._upload_images()
 
     def batch(self, step: int) -> Batch:
         """Return this process's part of the batch of one step."""
-        return received(self._make(step))
+        return _received(*self._make(step))
 
     def batches(self, first_step: int, last_step: int) -> Generator[Batch, None, None]:
         """Yield this process's part of each batch, from ``first_step`` to before ``last_step``.
@@ -292,33 +132,125 @@ class BatchLoader:
             yield from map(self.batch, range(first_step, last_step))
             return
         pool = ThreadPoolExecutor(WORKERS, thread_name_prefix="batches")
-        ahead: deque[Future[Gathered]] = deque()
+        ahead: deque[Future[tuple[Batch, torch.cuda.Event | None]]] = deque()
         try:
             for step in range(first_step, last_step):
                 ahead.append(pool.submit(self._make, step))
                 if len(ahead) > self._depth:
-                    yield received(ahead.popleft().result())
+                    yield _received(*ahead.popleft().result())
             while ahead:
-                yield received(ahead.popleft().result())
+                yield _received(*ahead.popleft().result())
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _make(self, step: int) -> Gathered:
-        examples = self._schedule.batch(step)
-        count = len(examples)
+    def _make(self, step: int) -> tuple[Batch, torch.cuda.Event | None]:
+        """Return a batch, and the event after which it may be read; None if at once."""
+        examples = self._sampler.batch(step)
+        count, n_obs_steps = len(examples), self._model.n_obs_steps
         episodes, starts = examples.T
-        rows, is_pad = chunk_rows(self._offsets, episodes, starts, self._chunk_size)
-        noise = noise_of(self._seed, "noise", step, count, self._noise_size)
-        state_noise = self._state_noise.draw(self._seed, step, count)
+        chunks, is_pad = chunk_rows(self._offsets, episodes, starts, self._model.chunk_size)
+        windows = window_rows(self._offsets, episodes, starts, n_obs_steps)
+        noise = step_noise(self._seed, "noise", step, count, self._model.noise_size)
+        state_noise: Tensor | None = None
+        if self._state_noise:
+            state_noise = self._state_noise.draw(self._seed, step, count * n_obs_steps)
         part = part_of(count, self._rank, self._world_size)
-        num_valid = float((~is_pad).sum()) / self._world_size
-        return self._tables.gather(
-            Examples(
-                rows=rows[part],
-                is_pad=is_pad[part],
-                noise=noise[part],
-                state_noise=None if state_noise is None else state_noise[part],
-                num_valid=num_valid,
-                num_examples=count / self._world_size,
-            )
+        if state_noise is not None:
+            state_noise = state_noise.view(count, n_obs_steps, -1)[part]
+        gather = self._gather if self._stream is None else self._gather_on_device
+        # All processes divide by the same number, the mean over the processes.
+        return gather(
+            windows[part],
+            chunks[part],
+            state_noise,
+            is_pad=torch.from_numpy(is_pad[part]),
+            noise=noise[part],
+            num_valid=torch.tensor(float((~is_pad).sum()) / self._world_size),
+            num_examples=torch.tensor(count / self._world_size),
         )
+
+    def _gather(
+        self,
+        windows: NDArray[np.int64],
+        chunks: NDArray[np.int64],
+        state_noise: Tensor | None,
+        **others: Tensor,
+    ) -> tuple[Batch, None]:
+        """Gather rows in main memory.
+
+        With NumPy, not with torch: for so little data torch's threads take longer to meet than to
+        work, much longer on a busy machine.
+        """
+        state = torch.from_numpy(self._state[windows])
+        if state_noise is not None:
+            state += state_noise
+        images = None if self._images is None else torch.from_numpy(self._read_images(windows))
+        action = torch.from_numpy(self._action[chunks])
+        return Batch(state=state, images=images, action=action, **others), None
+
+    def _gather_on_device(
+        self,
+        windows: NDArray[np.int64],
+        chunks: NDArray[np.int64],
+        state_noise: Tensor | None,
+        **others: Tensor,
+    ) -> tuple[Batch, torch.cuda.Event]:
+        """Gather rows on the device, without waiting for it."""
+        host_images: Tensor | None = None
+        if self._images is not None and self._device_images is None:
+            shape = (*windows.shape, *self._images.shape)
+            host_images = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
+            self._read_images(windows, out=host_images.numpy())
+
+        def copied(tensor: Tensor) -> Tensor:
+            return tensor.pin_memory().to(self._device, non_blocking=True)
+
+        with torch.cuda.stream(self._stream):
+            rows = copied(torch.from_numpy(windows))
+            images = None if self._device_images is None else self._device_images[rows]
+            if host_images is not None:
+                images = host_images.to(self._device, non_blocking=True)
+            state = self._device_state[rows]
+            if state_noise is not None:
+                state += copied(state_noise)
+            action = self._device_action[copied(torch.from_numpy(chunks))]
+            others = {name: copied(tensor) for name, tensor in others.items()}
+            ready = torch.cuda.Event()
+            ready.record(self._stream)
+        return Batch(state=state, images=images, action=action, **others), ready
+
+    def _read_images(
+        self, windows: NDArray[np.int64], out: NDArray[np.uint8] | None = None
+    ) -> NDArray[np.uint8]:
+        """Return (b, O, N, H, W, 3)."""
+        assert self._images is not None
+        shape = self._images.shape
+        out = None if out is None else out.reshape(-1, *shape)
+        images = self._images.images(self._rows[windows.ravel()], out)
+        return images.reshape(*windows.shape, *shape)
+
+    def _upload_images(self) -> Tensor | None:
+        """Return the images (R, N, H, W, 3) of all rows; None if they are not held, or too many."""
+        if self._images is None or self._images.held is None:
+            return None
+        shape = (len(self._rows), *self._images.shape)
+        if math.prod(shape) > torch.cuda.mem_get_info(self._device)[0] // 2:
+            return None
+        images = torch.empty(shape, dtype=torch.uint8, device=self._device)
+        for first in range(0, len(self._rows), UPLOAD):
+            part = self._rows[first : first + UPLOAD]
+            images[first : first + len(part)] = torch.from_numpy(self._images.images(part))
+        return images
+
+
+def _received(batch: Batch, ready: torch.cuda.Event | None) -> Batch:
+    """Make the current stream, of the thread that uses the batch, wait until the batch is there."""
+    if ready is not None:
+        stream = torch.cuda.current_stream(batch.state.device)
+        stream.wait_event(ready)
+        for field in fields(batch):
+            tensor = getattr(batch, field.name)
+            if tensor is not None:
+                # Allocated on another stream: it must not be reused before this one is done.
+                tensor.record_stream(stream)
+    return batch

@@ -1,10 +1,11 @@
-"""Where training runs, and in which precision."""
+"""Device of a training run: its choice, its precision, its timer, and processes that share it."""
 
 from __future__ import annotations
 
 import gc
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ DEVICE_TYPES = ("cpu", "cuda")
 
 
 def choose_device(given: str, local_rank: int = 0) -> torch.device:
-    """Return the device that ``--device`` means; ``auto`` is a GPU where there is one.
+    """Return the device of ``--device``; ``auto`` is a GPU where there is one.
 
     Args:
         given: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``.
@@ -40,7 +41,7 @@ def choose_device(given: str, local_rank: int = 0) -> torch.device:
         return torch.device("cpu")
     if not torch.cuda.is_available():
         raise RequestError(
-            f"device '{given}': PyTorch {torch.__version__} finds no CUDA device; say --device cpu"
+            f"device '{given}': PyTorch {torch.__version__} finds no CUDA device; use --device cpu"
         )
     index = local_rank if device.index is None else device.index
     if index >= torch.cuda.device_count():
@@ -54,8 +55,8 @@ def autocast_type(
     """Return the type of autocast, None for fp32 throughout.
 
     ``auto`` is bf16 on CUDA, and on CPUs with bf16 instructions if there are images to convolve,
-    which is where it saves most of the time. Networks without images stay fp32 on CPU: they are
-    quick enough, and keep all digits of positions.
+    where it saves most. Networks without images stay fp32 on CPU: they are quick enough, and keep
+    all digits of positions.
 
     Raises:
         RequestError: the device computes no bf16.
@@ -72,7 +73,7 @@ def autocast_type(
 
 
 def prepare_device(device: torch.device, compile_network: bool) -> None:
-    """Set what PyTorch does with fp32 on CUDA: TF32 products, convolutions chosen by measuring.
+    """Let PyTorch use TF32 products on CUDA, and choose convolutions by measuring.
 
     Raises:
         RequestError: ``--compile`` on a CPU without a C++ compiler.
@@ -86,16 +87,66 @@ def prepare_device(device: torch.device, compile_network: bool) -> None:
 
 
 def describe_device(device: torch.device) -> str:
-    """Name the device for people."""
+    """Return the name of the device, for logs."""
     if device.type == "cuda":
         return f"{device} ({torch.cuda.get_device_name(device)})"
     return f"cpu ({torch.get_num_threads()} threads)"
 
 
 def _has_fast_bf16() -> bool:
-    """Whether this processor multiplies bf16 in hardware, as far as PyTorch can tell."""
+    """Return whether this processor multiplies bf16 in hardware, as far as PyTorch knows."""
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # not in older releases
     return any(bool(capabilities.get(name)) for name in ("amx_bf16", "avx512_bf16"))
+
+
+PHASES = ("data", "forward", "backward", "optimizer")
+"""Of a training step; data: waiting for the batch; optimizer: clipping, AdamW and the average."""
+
+
+class StepTimer:
+    """Time of each phase of a training step, without making the GPU wait.
+
+    Each step calls `mark` with the names of ``PHASES`` in order. ``data`` is measured on the host,
+    the others where they run: on CUDA with events on the stream, read when the times are needed.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._on_cuda = device.type == "cuda"
+        self._reset()
+        self.skip()
+
+    def mark(self, phase: str) -> None:
+        """Mark the end of a phase."""
+        now = time.perf_counter()
+        if phase == "data":
+            self._steps += 1
+        if phase == "data" or not self._on_cuda:
+            self._seconds[phase] += now - self._last
+        self._last = now
+        if self._on_cuda:
+            event = torch.cuda.Event(enable_timing=True)
+            event.record()
+            self._events.append((phase, event))
+
+    def skip(self) -> None:
+        """Leave out the time since the last mark: logging, validation, saving."""
+        self._last = time.perf_counter()
+
+    def read(self) -> dict[str, float]:
+        """Return mean seconds a step by phase since the last call; on CUDA, wait for the device."""
+        if self._events:
+            torch.cuda.synchronize()
+            for (_, start), (phase, end) in zip(self._events, self._events[1:], strict=False):
+                if phase != "data":
+                    self._seconds[phase] += start.elapsed_time(end) / 1e3
+        means = {phase: total / max(self._steps, 1) for phase, total in self._seconds.items()}
+        self._reset()
+        return means
+
+    def _reset(self) -> None:
+        self._steps = 0
+        self._seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
+        self._events: list[tuple[str, torch.cuda.Event]] = []
 
 
 @dataclass(frozen=True)
@@ -132,7 +183,7 @@ class Processes:
 
     @property
     def is_main(self) -> bool:
-        """Whether this process writes files and says things."""
+        """Whether this process writes files and logs."""
         return self.rank == 0
 
     @contextmanager
@@ -161,7 +212,7 @@ class Processes:
         return values
 
     def any(self, flag: bool, device: torch.device) -> bool:
-        """Whether the flag is set in any process; waits for the device."""
+        """Return whether the flag is set in any process; waits for the device."""
         if self.world_size == 1:
             return flag
         value = torch.tensor([float(flag)], device=device)

@@ -1,4 +1,4 @@
-"""Images of any steps of the demonstrations, held in memory or decoded when they are asked for.
+"""Images of the demonstrations, held in memory or decoded when they are needed.
 
 Legend: R steps of all demonstrations together, b steps asked for, N cameras, H and W image height
 and width.
@@ -10,9 +10,8 @@ import os
 import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 import numpy as np
@@ -29,16 +28,16 @@ MAX_OPEN_FILES = 256
 """Episode files open at a time; the usual limit of a process is 1024 files of all kinds."""
 
 UNKNOWN_MEMORY = 4 * 2**30
-"""Bytes taken to be free where the system does not say."""
+"""Bytes assumed to be free where the system does not report it."""
 
 
-class FrameSource:
-    """Gives the images of steps, in the order of ``spec.cameras``, at the size ``spec.image_size``.
+class ImageStore(AbstractContextManager["ImageStore"]):
+    """Images of steps, in the order of ``spec.cameras``, at the size ``spec.image_size``.
 
     Images that fit into ``memory_budget`` are decoded once and held. Otherwise each is read from
-    its file, which stays open, and decoded when it is asked for. A pool of threads does the
-    decoding. The pixels are the same either way, and each picture is checked against its checksum
-    when it is read.
+    its file, which stays open, and decoded when it is needed. A pool of threads does the decoding.
+    The pixels are the same either way, and each image is checked against its checksum when it is
+    read.
 
     May be used from several threads. Use as a context manager, or call `close`.
 
@@ -53,8 +52,8 @@ class FrameSource:
         held: (R, N, H, W, 3) uint8 if all images are held, otherwise None.
 
     Raises:
-        RequestError: there is no camera to show.
-        EpisodeFileError: a picture that is to be held is damaged.
+        RequestError: there is no camera.
+        EpisodeFileError: an image that is to be held is damaged.
     """
 
     def __init__(
@@ -84,15 +83,7 @@ class FrameSource:
                 self.close()
                 raise
 
-    def __enter__(self) -> FrameSource:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def images(self, rows: NDArray[np.int64], out: Images | None = None) -> Images:
@@ -100,31 +91,31 @@ class FrameSource:
 
         Args:
             rows: places among the R steps of the demonstrations.
-            out: where to write them, if given.
+            out: array to write them to.
 
         Raises:
             IndexError: there is no such step.
-            EpisodeFileError: a picture is damaged; names file, camera and step.
+            EpisodeFileError: an image is damaged; names file, camera and step.
         """
         if len(rows) and not 0 <= rows.min() <= rows.max() < self._offsets[-1]:
             raise IndexError(f"rows 0 to {self._offsets[-1] - 1}, not {rows.min()} to {rows.max()}")
-        pictures: Images = np.empty((len(rows), *self.shape), np.uint8) if out is None else out
+        images: Images = np.empty((len(rows), *self.shape), np.uint8) if out is None else out
         if self.held is not None:
             # Unlike indexing, and unlike the mode "raise", this lets other threads run meanwhile.
-            np.take(self.held, rows, axis=0, out=pictures, mode="clip")
-            return pictures
+            np.take(self.held, rows, axis=0, out=images, mode="clip")
+            return images
         episodes = np.searchsorted(self._offsets, rows, side="right") - 1
-        jobs = []
+        decoded = []
         for place, (row, episode) in enumerate(zip(rows, episodes, strict=True)):
             step = int(row - self._offsets[episode])
             for index, camera in enumerate(self._cameras):
                 with self._reading:  # HDF5 itself reads one thing at a time
                     data = self._reader(int(episode)).encoded_frame(camera, step)
-                job = (data, pictures[place, index], self._paths[episode], camera, step)
-                jobs.append(self._pool.submit(_decode, *job))
-        for job in jobs:
-            job.result()
-        return pictures
+                arguments = (data, images[place, index], self._paths[episode], camera, step)
+                decoded.append(self._pool.submit(_decode, *arguments))
+        for future in decoded:
+            future.result()
+        return images
 
     def close(self) -> None:
         """Close the files and end the threads; may be called again."""
@@ -148,10 +139,10 @@ class FrameSource:
         def decode_episode(index: int) -> None:
             with EpisodeReader(self._paths[index]) as episode:
                 for step in range(len(episode)):
-                    pictures = held[self._offsets[index] + step]
-                    for camera, picture in zip(self._cameras, pictures, strict=True):
+                    images = held[self._offsets[index] + step]
+                    for camera, image in zip(self._cameras, images, strict=True):
                         data = episode.encoded_frame(camera, step)
-                        _decode(data, picture, episode.path, camera, step)
+                        _decode(data, image, episode.path, camera, step)
 
         numbers = range(len(self._paths))
         done = self._pool.map(decode_episode, numbers)
@@ -194,7 +185,7 @@ def processors() -> int:
 
 
 def _decode(data: Images, out: Images, path: Path, camera: str, step: int) -> None:
-    """Write the decoded picture to ``out``, (H, W, 3)."""
+    """Write the decoded image to ``out``, (H, W, 3)."""
     try:
         out[:] = fit_image(decode_image(data), (out.shape[0], out.shape[1]))
     except ValueError as error:

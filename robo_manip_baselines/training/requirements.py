@@ -1,4 +1,4 @@
-"""What must be so before PyTorch is imported: that it is there, and how its threads wait."""
+"""Preparation for importing PyTorch: installed packages, and how its threads wait."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ cores: 0 gave 13 steps/s idle and 11 beside a busy program, 3000 gave 20 and 9, 
 
 
 def prepare_pytorch() -> None:
-    """Make sure that training can be imported; tell OpenMP how to wait.
+    """Make sure that PyTorch is installed, and set how OpenMP waits; call it before the import.
 
     Threads of GNU OpenMP that have nothing to do spin for long before they sleep, which takes the
     processor from the thread that they wait for as soon as another program is running: steps have

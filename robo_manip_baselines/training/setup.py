@@ -1,10 +1,9 @@
-"""What a training run is: demonstrations, split, statistics, schedule, network."""
+"""Setup of a training run: demonstrations, split, normalisation, sampler, network, run folder."""
 
 from __future__ import annotations
 
-import platform
+import shutil
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,120 +15,174 @@ from robo_manip_baselines.data.demonstrations import (
     load_demonstrations,
     split_episodes,
 )
-from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.data.normalization import METHODS, Normalization
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.policy.checkpoint import (
     Checkpoint,
+    read_checkpoint,
     without_initial_weights,
 )
-from robo_manip_baselines.policy.interface import PolicyModel
-from robo_manip_baselines.policy.presets import Sizes
+from robo_manip_baselines.policy.interface import PolicyDims, PolicyModel
 from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
+from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.metrics import MetricsLog, open_board
 from robo_manip_baselines.runs.seeds import derive_seed
-from robo_manip_baselines.training.options import TrainOptions
-from robo_manip_baselines.training.sampling import Schedule
+from robo_manip_baselines.runs.versions import software_versions
+from robo_manip_baselines.training.config import (
+    CONFIG,
+    METRICS,
+    TrainConfig,
+    require_same_config,
+    write_config,
+)
+from robo_manip_baselines.training.sampling import ExampleSampler
 
 
 @dataclass(frozen=True)
-class Job:
-    """What is trained on what; a function of the options and of the demonstrations.
+class TrainSetup:
+    """Data and budget of a training run, a function of its configuration and demonstrations.
 
     Attributes:
-        options: as given.
+        config: of the run.
         demonstrations: all episodes.
-        split: which are trained on.
-        normalization: measured on those.
-        schedule: which examples each step sees.
+        split: training episodes and episodes held out.
+        normalization: measured on the training episodes.
+        sampler: of the examples of each step.
         total_steps: the budget.
     """
 
-    options: TrainOptions[Any]
+    config: TrainConfig[Any]
     demonstrations: Demonstrations
     split: Split
     normalization: Normalization
-    schedule: Schedule
+    sampler: ExampleSampler
     total_steps: int
 
     @classmethod
-    def of(cls, options: TrainOptions[Any]) -> Job:
-        """Read the demonstrations and plan the run.
+    def load(cls, config: TrainConfig[Any]) -> TrainSetup:
+        """Read the demonstrations.
 
         Raises:
-            RequestError: there are none, or they do not fit the options.
+            RequestError: there are none, or they do not fit the configuration.
         """
-        settings, seed = options.training, options.seed
+        settings, seed = config.training, config.seed
         given = load_demonstrations(
-            options.demonstrations, options.spec, limit=options.num_episodes, env=options.env
+            config.demonstrations, config.spec, limit=config.num_episodes, env=config.env
         )
-        env_id = task_entry(options.env).env_id
+        env_id = task_entry(config.env).env_id
         if given.env_id != env_id:
-            raise RequestError(f"'{options.demonstrations}' holds {given.env_id}, not {env_id}")
+            raise RequestError(f"'{config.demonstrations}' holds {given.env_id}, not {env_id}")
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = given.indices(split.train)
         rows = given.rows(train)
-        normalization = Normalization.of(given.state[rows], given.action[rows])
-        schedule = Schedule(given.lengths[list(train)], settings.sampler, settings.batch_size, seed)
-        total = schedule.total_steps(settings)
-        return cls(options, given, split, normalization, schedule, total)
+        method = policy_entry(config.policy).normalization
+        normalize = METHODS.get(method) or load_part(method)
+        sampler = ExampleSampler(
+            given.lengths[list(train)], settings.sampler, settings.batch_size, seed
+        )
+        return cls(
+            config,
+            given,
+            split,
+            normalize(given.state[rows], given.action[rows]),
+            sampler,
+            sampler.total_steps(settings),
+        )
 
     @property
-    def sizes(self) -> Sizes:
-        """What the network must fit."""
-        return Sizes(
+    def dims(self) -> PolicyDims:
+        """Dimensions of the network's inputs and outputs."""
+        return PolicyDims(
             state=self.demonstrations.state.shape[1],
             action=self.demonstrations.action.shape[1],
             cameras=len(self.demonstrations.spec.cameras),
             image=self.demonstrations.spec.image_size,
         )
 
-    @property
-    def total_frames(self) -> int:
-        """Examples of the whole budget."""
-        return self.total_steps * self.schedule.batch_size
-
-    def make_model(self, is_start: bool) -> PolicyModel:
+    def make_model(self, *, initial_weights: bool = True) -> PolicyModel:
         """Build the network; the seed decides its random weights.
 
         Args:
-            is_start: whether these are the weights that training begins with.
+            initial_weights: whether to read the policy's file of initial weights, if it names one.
         """
-        config = self.options.network
-        torch.manual_seed(derive_seed(self.options.seed, "weights"))
-        return make_model(
-            self.options.policy,
-            config if is_start else without_initial_weights(config),
-            self.sizes,
-        )
+        config = self.config.network
+        config = config if initial_weights else without_initial_weights(config)
+        torch.manual_seed(derive_seed(self.config.seed, "weights"))
+        return make_model(self.config.policy, config, self.dims)
 
-    def checkpoint(self) -> Checkpoint:
-        """What every checkpoint of the run says; folder and step are set when it is written."""
-        options, given = self.options, self.demonstrations
-        presets = load_part(policy_entry(options.policy).presets)
+    def checkpoint(self, step: int) -> Checkpoint:
+        """Return the description of a checkpoint of the run; its folder is set when written."""
+        config, given = self.config, self.demonstrations
         return Checkpoint(
             folder=Path(),
-            policy=options.policy,
-            config=options.network,
-            sizes=self.sizes,
+            policy=config.policy,
+            config=config.network,
+            dims=self.dims,
             spec=given.spec,
-            env=options.env,
-            acting=presets[options.preset].acting,
+            env=config.env,
+            execution=config.execution,
             normalization=self.normalization,
             action_names=given.action_names,
             control_period=given.control_period,
             xml_hash=given.xml_hash,
-            step=0,
-            train_seed=options.seed,
-            settings=options.training,
+            step=step,
+            train_seed=config.seed,
+            settings=config.training,
             split=self.split,
             dataset={
-                "folder": str(options.demonstrations),
+                "folder": str(config.demonstrations),
                 "episodes": len(given.seeds),
                 "content_hash": given.content_hash,
                 "env_kwargs": dict(given.env_kwargs),
             },
-            versions={
-                "python": platform.python_version(),
-                **{name: version(name) for name in ("torch", "numpy", "robo_manip_baselines")},
-            },
+            versions=software_versions("torch", "numpy", "robo_manip_baselines"),
         )
+
+    def find_start(self, resume: bool) -> Checkpoint | None:
+        """Return the newest checkpoint of the run folder; None to train from the beginning.
+
+        Raises:
+            RequestError: the run folder holds another run, or this one and ``resume`` is False; or
+                the demonstrations have changed since.
+        """
+        run = self.config.folder
+        if not list_checkpoints(run):
+            return None
+        require_same_config(run, self.config)
+        checkpoint = read_checkpoint(run)
+        if not resume:
+            done = checkpoint.step >= self.total_steps
+            raise RequestError(
+                f"'{run}' holds this run, {'finished' if done else f'at step {checkpoint.step}'}; "
+                + ("choose another --out or --seed" if done else "--resume continues it")
+            )
+        if checkpoint.dataset["content_hash"] != self.demonstrations.content_hash:
+            raise RequestError(
+                f"the demonstrations in '{self.config.demonstrations}' are not the ones that "
+                f"'{run}' was trained on; give those with --dataset, or choose another --out"
+            )
+        if checkpoint.spec != self.demonstrations.spec:
+            raise RequestError(
+                f"the error statistics are not the ones that '{run}' was trained with; give those "
+                "with --error_stats, or choose another --out"
+            )
+        return checkpoint
+
+    def open_log(self, start: Checkpoint | None) -> MetricsLog:
+        """Prepare the run folder and open its metrics.
+
+        Raises:
+            RequestError: the logger is not installed, or the folder is damaged.
+        """
+        run, config = self.config.folder, self.config
+        remove_partial_checkpoints(run)
+        if start is None:  # an earlier run may have left something before its first checkpoint
+            (run / METRICS).unlink(missing_ok=True)
+            shutil.rmtree(run / "tensorboard", ignore_errors=True)
+            write_config(run, config)
+        elif not (run / CONFIG).is_file():
+            raise RequestError(f"'{run}' has lost its {CONFIG}; choose another --out")
+        step = start.step if start else 0
+        board = open_board(config.logger, run, step, config.to_json())
+        return MetricsLog(run / METRICS, step, board)

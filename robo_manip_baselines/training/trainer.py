@@ -1,399 +1,311 @@
-"""What training needs beside the evaluated weights to go on exactly: flat tensors and JSON.
-
-Tensors are named ``weights/NAME`` (only where an average is what is evaluated),
-``exp_avg/NAME`` and ``exp_avg_sq/NAME`` (AdamW), and ``metrics`` (sums since the last line of
-``metrics.jsonl``); NAME is the parameter's name in the network.
-"""
+"""The training loop."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
+import math
 import os
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
-import safetensors.torch
 import torch
-from torch import Tensor
-from tqdm import tqdm
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
-from robo_manip_baselines.data.demonstrations import Demonstrations
-from robo_manip_baselines.policy.checkpoint import MODEL, Checkpoint, read_trainer, write_checkpoint
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
+from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.checkpoints import prune_checkpoints, step_folder
+from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.metrics import MetricsLog
+from robo_manip_baselines.runs.files import locked
+from robo_manip_baselines.runs.interrupt import StopRequest
+from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
+from robo_manip_baselines.runs.progress import StepProgress
+from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.batching import BatchLoader
-from robo_manip_baselines.training.device import Processes, autocast_type
-from robo_manip_baselines.training.images import FrameSource, free_memory
+from robo_manip_baselines.training.config import CURVES, METRICS, TrainConfig
+from robo_manip_baselines.training.device import (
+    Processes,
+    StepTimer,
+    autocast_type,
+    choose_device,
+    describe_device,
+    prepare_device,
+)
+from robo_manip_baselines.training.images import ImageStore, free_memory
+from robo_manip_baselines.training.optim import learning_rate_factor, set_learning_rate
 from robo_manip_baselines.training.sampling import StateNoise
-from robo_manip_baselines.training.setup import Job
-from robo_manip_baselines.training.step import RunningMean, TrainStep
-from robo_manip_baselines.training.validation import Validation
-
-_MOMENTS = ("exp_avg", "exp_avg_sq")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a run has come.
-
-    Attributes:
-        step: optimiser steps done.
-        seconds: spent on them, by all processes that took part in turn.
-    """
-
-    step: int = 0
-    seconds: float = 0.0
-
-
-def trainer_state(
-    train_step: TrainStep, mean: RunningMean, progress: Progress
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return what `restore` takes."""
-    tensors: dict[str, Tensor] = {}
-    if train_step.average:
-        tensors |= {f"weights/{k}": v for k, v in train_step.model.state_dict().items()}
-    steps: dict[str, int] = {}
-    for name, parameter in _trained(train_step):
-        if state := train_step.optimizer.state.get(parameter):
-            tensors |= {f"{moment}/{name}": state[moment] for moment in _MOMENTS}
-            steps[name] = int(state["step"])
-    if mean.sums is not None:
-        tensors["metrics"] = mean.sums
-    # Every trained parameter has made as many steps as the others, unless some get no gradient.
-    json = {
-        "step": progress.step,
-        "seconds": progress.seconds,
-        "optimizer_steps": steps,
-        "metrics": {"names": list(mean.names), "count": mean.count},
-    }
-    return tensors, json
-
-
-@torch.no_grad()
-def restore(
-    train_step: TrainStep,
-    mean: RunningMean,
-    model_state: Mapping[str, Tensor],
-    tensors: Mapping[str, Tensor],
-    json: Mapping[str, Any],
-) -> Progress:
-    """Put a fresh `TrainStep` where another one was.
-
-    Args:
-        train_step: of the same network and settings; changed.
-        mean: changed.
-        model_state: the checkpoint's evaluated weights.
-        tensors: as `trainer_state` gave them.
-        json: the same.
-    """
-    online = model_state
-    if train_step.average:
-        train_step.average.model.load_state_dict(model_state)
-        online = {
-            name.removeprefix("weights/"): tensor
-            for name, tensor in tensors.items()
-            if name.startswith("weights/")
-        }
-    train_step.model.load_state_dict(online)
-    fused = bool(train_step.optimizer.defaults["fused"])
-    for name, parameter in _trained(train_step):
-        if name not in json["optimizer_steps"]:
-            continue
-        device = parameter.device if fused else "cpu"
-        # In the memory layout of the parameter, as AdamW itself makes them.
-        moments = {m: torch.empty_like(parameter).copy_(tensors[f"{m}/{name}"]) for m in _MOMENTS}
-        count = torch.tensor(float(json["optimizer_steps"][name]), device=device)
-        train_step.optimizer.state[parameter] = {"step": count, **moments}
-    mean.names = tuple(json["metrics"]["names"])
-    mean.count = json["metrics"]["count"]
-    mean.sums = tensors["metrics"].to(train_step.device) if mean.count else None
-    return Progress(json["step"], json["seconds"])
-
-
-def _trained(train_step: TrainStep) -> Iterator[tuple[str, torch.nn.Parameter]]:
-    grouped = {id(p) for group in train_step.optimizer.param_groups for p in group["params"]}
-    for name, parameter in train_step.model.named_parameters():
-        if id(parameter) in grouped:
-            yield name, parameter
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What a run is carried out with.
-
-    Attributes:
-        train_step: the network with its optimiser, where training begins or goes on.
-        mean: of the losses since they were last written.
-        progress: how far the run has come.
-        loader: of the training batches.
-        validation: None without episodes held out, and in all processes but the first.
-    """
-
-    train_step: TrainStep
-    mean: RunningMean
-    progress: Progress
-    loader: BatchLoader
-    validation: Validation | None
-
-
-@contextmanager
-def assembled(
-    job: Job, start: Checkpoint | None, device: torch.device, processes: Processes
-) -> Iterator[Parts]:
-    """Put the parts of a run together; images are held or read while the block lasts.
-
-    Args:
-        job: what to train on what.
-        start: where to go on from, None to begin.
-        device: to train on.
-        processes: that train together.
-
-    Raises:
-        RequestError: the network cannot be built, the device lacks the precision, or the
-            checkpoint has lost what training needs.
-    """
-    settings, seed = job.options.training, job.options.seed
-    autocast = autocast_type(settings.precision, device, bool(job.sizes.cameras))
-    model = job.make_model(is_start=start is None).to(device)
-    train_step = TrainStep(
-        model,
-        settings,
-        total_steps=job.total_steps,
-        seed=seed,
-        autocast=autocast,
-        processes=processes,
-    )
-    mean, progress = RunningMean(), Progress()
-    if start:
-        weights = safetensors.torch.load_file(start.folder / MODEL)
-        progress = restore(train_step, mean, weights, *read_trainer(start))
-    with _frames(job.demonstrations) as frames:
-        loader = BatchLoader(
-            job.demonstrations,
-            job.normalization,
-            job.demonstrations.indices(job.split.train),
-            job.schedule,
-            chunk_size=model.chunk_size,
-            noise_size=model.noise_size,
-            state_noise=StateNoise.of(job.demonstrations.spec, settings),
-            seed=seed,
-            device=device,
-            rank=processes.rank,
-            world_size=processes.world_size,
-            frames=frames,
-        )
-        validation = None
-        if job.split.validation and processes.is_main:
-            validation = Validation(
-                job.demonstrations,
-                job.normalization,
-                frames,
-                episodes=job.demonstrations.indices(job.split.validation),
-                batch_size=settings.batch_size,
-                seed=seed,
-                model=model,
-                device=device,
-                autocast=autocast,
-            )
-        yield Parts(train_step, mean, progress, loader, validation)
-
-
-def _frames(
-    demonstrations: Demonstrations,
-) -> contextlib.AbstractContextManager[FrameSource | None]:
-    if not demonstrations.spec.cameras:
-        return contextlib.nullcontext()
-    # Half of what is free is the source's own measure; the processes of one machine share it.
-    share = free_memory() // 2 // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    return FrameSource(demonstrations, memory_budget=share)
-
-
-logger = logging.getLogger(__name__)
-
-_STEPS_BETWEEN_VOTES = 10
-"""On several GPUs, steps between asking whether any process was told to stop: asking waits."""
+from robo_manip_baselines.training.setup import TrainSetup
+from robo_manip_baselines.training.state import TrainerState
+from robo_manip_baselines.training.validation import HeldOutLoss
 
 KEPT_CHECKPOINTS = 2
 
-_LINES = 10
-"""Lines about progress where there is no terminal for a bar."""
+_STEPS_BETWEEN_VOTES = 10
+"""On several GPUs, steps between asking whether any process is to stop: asking waits."""
+
+logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How training ended.
+def train(config: TrainConfig[Any], *, resume: bool = False) -> int:
+    """Train a policy until the budget is spent or somebody asks to stop.
 
-    Attributes:
-        step: steps done in all.
-        seconds: spent on them in all.
-        train: last means of the losses, by name.
-        validation: last losses on the episodes held out.
+    Writes the run folder, ``config.folder``: options, checkpoints, metrics and their curves. Under
+    ``torchrun`` every process calls this.
+
+    Args:
+        config: of the run.
+        resume: continue the run in the run folder, if there is one.
+
+    Returns:
+        The exit code: 0, or 130 after an interruption whose state is saved.
+
+    Raises:
+        RequestError: the configuration does not fit the demonstrations, the machine or the run
+            folder, or the loss is not finite any more.
     """
+    processes = Processes.from_environment()
+    if not processes.is_main:
+        logging.getLogger().setLevel(logging.WARNING)
+    device = choose_device(config.device, processes.local_rank)
+    prepare_device(device, config.training.compile)
+    with processes.joined(device):
+        # A function of its own: nothing of it must outlive the block and hold on to the processes.
+        return _train(config, resume, device, processes)
 
-    step: int
-    seconds: float
-    train: Mapping[str, float]
-    validation: Mapping[str, float]
+
+def _train(
+    config: TrainConfig[Any], resume: bool, device: torch.device, processes: Processes
+) -> int:
+    setup = TrainSetup.load(config)
+    with contextlib.ExitStack() as stack:
+        if processes.is_main:
+            stack.enter_context(locked(config.folder))
+        start = setup.find_start(resume)
+        if start and start.step >= setup.total_steps:
+            logger.info("%s is finished: %d steps", config.folder, start.step)
+        else:
+            processes.wait()  # until every process has seen the folder as it was
+            log = stack.enter_context(setup.open_log(start)) if processes.is_main else None
+            images = None
+            if setup.dims.cameras:
+                # Half of the free memory, which the processes of one machine share.
+                budget = free_memory() // 2 // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+                images = stack.enter_context(ImageStore(setup.demonstrations, memory_budget=budget))
+            trainer = Trainer(setup, start, device, processes, images=images, log=log)
+            stop = stack.enter_context(StopRequest(once_more=processes.world_size == 1))
+            if trainer.run(stop) < setup.total_steps:
+                return EXIT_INTERRUPTED
+        if processes.is_main:
+            _draw_curves(config)
+    return 0
 
 
 class Trainer:
-    """Trains until the budget is spent or somebody asks to stop.
+    """One process of a training run, at its beginning or at a checkpoint.
 
     Args:
-        job: what is trained on what.
-        parts: what it is trained with.
-        log: None in all processes but the first.
+        setup: of the run.
+        start: checkpoint to continue, None to begin.
+        device: of the network.
         processes: that train together.
-        stop: whether to stop after this step.
+        images: None without cameras.
+        log: None in all processes but the first.
+
+    Attributes:
+        state: network, optimiser and moving average.
+        loader: of the training batches.
+        held_out: loss on the episodes held out; None without any, and in all processes but the
+            first.
+
+    Raises:
+        RequestError: the network cannot be built, the device lacks the precision, or the
+            checkpoint lacks the trainer's state.
     """
 
     def __init__(
         self,
-        job: Job,
-        parts: Parts,
-        *,
-        log: MetricsLog | None,
+        setup: TrainSetup,
+        start: Checkpoint | None,
+        device: torch.device,
         processes: Processes,
-        stop: Callable[[], bool],
+        *,
+        images: ImageStore | None = None,
+        log: MetricsLog | None = None,
     ) -> None:
-        options = job.options
-        self._train_step = parts.train_step
-        self._mean = parts.mean
-        self._loader = parts.loader
-        self._validation = parts.validation
-        self._step = self._saved_step = parts.progress.step
-        self._seconds_before = parts.progress.seconds
-        self._checkpoint = job.checkpoint()
-        self._total_steps = job.total_steps
-        self._schedule = job.schedule
-        self._run = options.folder
-        self._log_every = options.log_every
-        self._validate_every = options.validate_every
-        self._checkpoint_every = options.checkpoint_every
-        self._log = log
-        self._processes = processes
-        self._stop = stop
-        self._train_losses: dict[str, float] = {}
-        self._validation_losses: dict[str, float] = {}
-        self._start = time.perf_counter()
+        config, given = setup.config, setup.demonstrations
+        settings = config.training
+        self._setup, self._device, self._processes, self._log = setup, device, processes, log
+        self._autocast = autocast_type(settings.precision, device, bool(given.spec.cameras))
+        model = setup.make_model(initial_weights=start is None).to(device)
+        self.state = TrainerState(model, settings)
+        seconds = self.state.restore(start) if start else 0.0
+        self._saved_step = start.step if start else 0
+        self._progress = StepProgress(
+            *(setup.total_steps, self._saved_step, seconds),
+            shown=processes.is_main,
+            log_every=config.log_every,
+        )
+        self._timer = StepTimer(device)
+        loss: nn.Module = _LossModule(model)
+        if processes.world_size > 1:
+            loss = DistributedDataParallel(loss, gradient_as_bucket_view=True)
+        self._compute_loss = torch.compile(loss) if settings.compile else loss
+        self.loader = BatchLoader(
+            *(given, setup.normalization, given.indices(setup.split.train), setup.sampler, model),
+            seed=config.seed,
+            device=device,
+            rank=processes.rank,
+            world_size=processes.world_size,
+            state_noise=StateNoise(
+                *(given.spec, task_entry(config.env).names),
+                robot=settings.state_noise,
+                clock=settings.clock_noise,
+            ),
+            images=images,
+        )
+        self.held_out: HeldOutLoss | None = None
+        if setup.split.validation and processes.is_main:
+            self.held_out = HeldOutLoss(setup, model, images, device, self._autocast)
+        self._announce()
 
-    def train(self) -> Outcome:
-        """Run the loop.
+    def run(self, stop: StopRequest) -> int:
+        """Train until the budget is spent or a stop is requested; return the steps done in all.
 
         Raises:
             RequestError: the loss is not finite any more.
         """
-        self._start = time.perf_counter()
-        bar = tqdm(
-            total=self._total_steps,
-            initial=self._step,
-            unit="step",
-            dynamic_ncols=True,
-            disable=True if not self._processes.is_main else None,
-        )
-        batches = self._loader.batches(self._step, self._total_steps)
-        with bar, contextlib.closing(batches):
-            self._train_step.clock.skip()
+        config, total_steps = self._setup.config, self._setup.total_steps
+        settings, model, optimizer = config.training, self.state.model, self.state.optimizer
+        autocast = torch.autocast(self._device.type, self._autocast, enabled=bool(self._autocast))
+        timer, progress = self._timer, self._progress
+        batches = self.loader.batches(progress.step, total_steps)
+        with progress, contextlib.closing(batches):
+            timer.skip()
             for batch in batches:
-                self._mean.add(self._train_step(batch, self._step))
-                self._step += 1
-                bar.update()
-                if self._after_step(bar):
+                timer.mark("data")
+                step = progress.step
+                if not model.training:
+                    model.train()
+                torch.manual_seed(derive_seed(config.seed, "dropout", self._processes.rank, step))
+                set_learning_rate(optimizer, learning_rate_factor(step, total_steps, settings))
+                with autocast:
+                    losses = self._compute_loss(batch)
+                timer.mark("forward")
+                losses["loss"].backward()
+                timer.mark("backward")
+                if settings.clip_norm:
+                    norm = nn.utils.clip_grad_norm_(self.state.trained, settings.clip_norm)
+                    losses = {**losses, "grad_norm": norm}
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+                if self.state.average:
+                    self.state.average.update(step)
+                timer.mark("optimizer")
+                self.state.losses.add(losses)
+                progress.advance()
+
+                is_stopping = self._is_stopping(stop)
+                if progress.is_due(config.log_every):
+                    progress.report(self._log_losses())
+                if self.held_out and progress.is_due(config.validate_every):
+                    self._write("validation", self.held_out(self.state.evaluated))
+                if progress.is_due(config.checkpoint_every) or is_stopping:
+                    self._save()
+                if is_stopping:
                     break
-        return Outcome(self._step, self._seconds(), self._train_losses, self._validation_losses)
+                timer.skip()
+        return progress.step
 
-    def _after_step(self, bar: tqdm) -> bool:
-        """Write what is due; return whether to stop."""
-        is_log = self._is_due(self._log_every)
-        is_validation = self._is_due(self._validate_every)
-        is_stopping = self._is_stopping()
-        is_checkpoint = self._is_due(self._checkpoint_every) or is_stopping
-        if is_log:
-            self._write_losses()
-            bar.set_postfix(loss=f"{self._train_losses['loss']:.4g}", refresh=False)
-            self._say_progress(bar)
-        if is_validation and self._validation:
-            self._validation_losses = self._validation(self._train_step.result)
-            self._write("validation", self._validation_losses)
-        if is_checkpoint:
-            self._save()
-        if is_log or is_validation or is_checkpoint:
-            self._train_step.clock.skip()
-        return is_stopping
-
-    def _is_due(self, interval: int) -> bool:
-        return self._step % interval == 0 or self._step == self._total_steps
-
-    def _is_stopping(self) -> bool:
-        device = self._train_step.device
-        alone = self._processes.world_size == 1
-        if not alone and device.type == "cuda" and self._step % _STEPS_BETWEEN_VOTES:
+    def _is_stopping(self, stop: StopRequest) -> bool:
+        """Return whether any process was asked to stop."""
+        waits = self._processes.world_size > 1 and self._device.type == "cuda"
+        if waits and self._progress.step % _STEPS_BETWEEN_VOTES:
             return False
-        return self._processes.any(self._stop(), device)
+        return self._processes.any(stop.is_made, self._device)
 
-    def _write_losses(self) -> None:
-        means = self._processes.mean(self._mean.means()).tolist()  # the one transfer
-        self._train_losses = dict(zip(self._mean.names, means, strict=True))
-        self._mean.reset()
-        loss = self._train_losses["loss"]
-        self._require_finite(torch.isfinite(torch.tensor(loss)))
-        group = self._train_step.optimizer.param_groups[0]
-        phases = {f"seconds_{k}": v for k, v in self._train_step.clock.read().items()}
-        more = {"learning_rate": group["lr"], "seconds": self._seconds(), **phases}
-        self._write("train", {**self._train_losses, **more})
+    def _log_losses(self) -> float:
+        """Write the mean losses since the last line; return the loss."""
+        means = self._processes.mean(self.state.losses.means()).tolist()  # the one transfer
+        losses = dict(zip(self.state.losses.names, means, strict=True))
+        self.state.losses.reset()
+        self._require_finite(math.isfinite(losses["loss"]))
+        values = {
+            **losses,
+            "learning_rate": self.state.optimizer.param_groups[0]["lr"],
+            "seconds": self._progress.seconds,
+            **{f"seconds_{phase}": seconds for phase, seconds in self._timer.read().items()},
+        }
+        self._write("train", values)
+        return losses["loss"]
 
     def _write(self, kind: str, values: Mapping[str, float]) -> None:
         if self._log:
-            epoch = self._schedule.epochs(self._step)
-            self._log.write(kind, self._step, {"epoch": epoch, **values})
-
-    def _say_progress(self, bar: tqdm) -> None:
-        between = max(self._total_steps // _LINES, 1)
-        if bar.disable and self._processes.is_main and self._step % between < self._log_every:
-            seconds = self._seconds()
-            left = seconds / self._step * (self._total_steps - self._step)
-            logger.info(
-                "step %d of %d, loss %.4g, %.0f s, %.0f s left",
-                self._step,
-                self._total_steps,
-                self._train_losses["loss"],
-                seconds,
-                left,
-            )
-            sys.stderr.flush()
+            step = self._progress.step
+            self._log.write(kind, step, {"epoch": self._setup.sampler.epochs(step), **values})
 
     def _save(self) -> None:
-        sums = self._mean.sums
-        state = self._train_step.result.state_dict()
-        finite = [torch.isfinite(v).all() for v in state.values() if v.is_floating_point()]
-        self._require_finite(
-            torch.stack(finite + ([] if sums is None else [sums.isfinite().all()]))
-        )
-        if not self._processes.is_main:
-            return
-        folder = step_folder(self._run, self._step)
-        progress = Progress(self._step, self._seconds())
-        tensors, json = trainer_state(self._train_step, self._mean, progress)
-        checkpoint = dataclasses.replace(self._checkpoint, step=self._step)
-        write_checkpoint(folder, checkpoint, state, tensors, json)
-        self._saved_step = self._step
-        prune_checkpoints(self._run, KEPT_CHECKPOINTS)
+        """Write a checkpoint, if all weights are finite, and remove old ones."""
+        weights = self.state.evaluated.state_dict()
+        flags = [torch.isfinite(v).all() for v in weights.values() if v.is_floating_point()]
+        if self.state.losses.sums is not None:
+            flags.append(self.state.losses.sums.isfinite().all())
+        self._require_finite(bool(torch.stack(flags).all()))
+        if self._processes.is_main:
+            run, step = self._setup.config.folder, self._progress.step
+            tensors, json = self.state.state_dict(step, self._progress.seconds)
+            checkpoint = self._setup.checkpoint(step)
+            write_checkpoint(step_folder(run, step), checkpoint, weights, tensors, json)
+            self._saved_step = step
+            prune_checkpoints(run, KEPT_CHECKPOINTS)
 
-    def _require_finite(self, flags: torch.Tensor) -> None:
-        if not self._processes.any(not bool(flags.all()), self._train_step.device):
-            return
-        kept = f"the checkpoint of step {self._saved_step} is kept" if self._saved_step else ""
-        raise RequestError(
-            f"the loss is not finite any more at step {self._step}; lower --learning_rate, try "
-            f"--clip_norm 1 or --precision fp32{'; ' * bool(kept)}{kept}"
-        )
+    def _require_finite(self, is_finite: bool) -> None:
+        if self._processes.any(not is_finite, self._device):
+            saved = self._saved_step
+            kept = f"; the checkpoint of step {saved} is kept" if saved else ""
+            raise RequestError(
+                f"the loss is not finite any more at step {self._progress.step}; lower "
+                f"--learning_rate, try --clip_norm 1 or --precision fp32{kept}"
+            )
 
-    def _seconds(self) -> float:
-        return self._seconds_before + time.perf_counter() - self._start
+    def _announce(self) -> None:
+        setup, config, sampler = self._setup, self._setup.config, self._setup.sampler
+        total, processes = setup.total_steps, self._processes.world_size
+        examples = "starts" if config.training.sampler == "episode" else "frames"
+        parameters = list(self.state.model.parameters())
+        for line in (
+            f"preset: {config.preset}, seed {config.seed}",
+            f"run folder: {config.folder}",
+            f"episodes: {len(setup.split.train)} for training, {len(setup.split.validation)} held "
+            "out",
+            f"budget: {sampler.epochs(total):.4g} epochs x {sampler.frames_per_epoch} {examples} = "
+            f"{total} steps of {sampler.batch_size} = {total * sampler.batch_size} frames",
+            f"device: {describe_device(self._device)}"
+            + (f", {processes} processes" if processes > 1 else "")
+            + f", precision {'bf16' if self._autocast else 'fp32'}",
+            f"{config.policy}: {sum(p.numel() for p in parameters):,} weights, "
+            f"{sum(p.numel() for p in parameters if p.requires_grad):,} trained",
+        ):
+            logger.info("%s", line)
+
+
+class _LossModule(nn.Module):
+    """A network whose call is its loss: the form that DDP and ``torch.compile`` take."""
+
+    def __init__(self, model: PolicyModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the loss and its parts."""
+        return self.model.loss(batch)
+
+
+def _draw_curves(config: TrainConfig[Any]) -> None:
+    run = config.folder
+    if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
+        logger.info("curves: %s", run / CURVES)
+    else:
+        logger.info("no image of the curves: pip install matplotlib")

@@ -6,60 +6,48 @@ import contextlib
 
 import torch
 
-from robo_manip_baselines.data.demonstrations import Demonstrations
-from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.batching import BatchLoader
-from robo_manip_baselines.training.images import FrameSource
-from robo_manip_baselines.training.sampling import Schedule
+from robo_manip_baselines.training.images import ImageStore
+from robo_manip_baselines.training.sampling import ExampleSampler
+from robo_manip_baselines.training.setup import TrainSetup
 
 STARTS = 8
-"""Examples of each episode: enough for a smooth curve, a small share of training's time."""
+"""Examples of each episode: enough for a smooth curve, little of training's time."""
 
 
-class Validation:
-    """Computes the mean loss over fixed examples of some episodes.
+class HeldOutLoss:
+    """Mean loss over fixed examples of the episodes held out.
 
     Args:
-        demonstrations, normalization, frames: as in training.
-        episodes: indices of the episodes that are held out, one or more.
-        batch_size: examples at a time.
-        seed: of the run; the examples are drawn from it.
-        model: whose chunk and noise size count.
-        device: where it is.
+        setup: of the run; one or more of its episodes are held out.
+        model: its chunk size, observation steps and noise size are read.
+        images: of the demonstrations; None without cameras.
+        device: of the network.
         autocast: type of autocast, or None.
     """
 
     def __init__(
         self,
-        demonstrations: Demonstrations,
-        normalization: Normalization,
-        frames: FrameSource | None,
-        *,
-        episodes: tuple[int, ...],
-        batch_size: int,
-        seed: int,
+        setup: TrainSetup,
         model: PolicyModel,
+        images: ImageStore | None,
         device: torch.device,
         autocast: torch.dtype | None,
     ) -> None:
-        own_seed = derive_seed(seed, "validation")
-        schedule = Schedule(demonstrations.lengths[list(episodes)], "episode", batch_size, own_seed)
+        seed = derive_seed(setup.config.seed, "validation")
+        given, batch_size = setup.demonstrations, setup.config.training.batch_size
+        episodes = given.indices(setup.split.validation)
+        sampler = ExampleSampler(given.lengths[list(episodes)], "episode", batch_size, seed)
         self._loader = BatchLoader(
-            demonstrations,
-            normalization,
-            episodes,
-            schedule,
-            chunk_size=model.chunk_size,
-            noise_size=model.noise_size,
-            seed=own_seed,
+            *(given, setup.normalization, episodes, sampler, model),
+            seed=seed,
             device=device,
-            frames=frames,
+            images=images,
         )
         self._steps = -(-STARTS * len(episodes) // batch_size)
-        self._device = device
-        self._autocast = autocast
+        self._device, self._autocast = device, autocast
 
     @torch.no_grad()
     def __call__(self, model: PolicyModel) -> dict[str, float]:
@@ -67,8 +55,7 @@ class Validation:
         was_training = model.training
         model.eval()
         names: list[str] = []
-        sums: torch.Tensor | None = None
-        weight: torch.Tensor | None = None
+        sums, weight = torch.zeros((), device=self._device), torch.zeros((), device=self._device)
         on = self._autocast is not None
         with (
             torch.autocast(self._device.type, self._autocast, enabled=on),
@@ -77,10 +64,8 @@ class Validation:
             for batch in batches:
                 parts = model.loss(batch)
                 names = list(parts)
-                values = torch.stack([v.double() for v in parts.values()]) * batch.num_valid
-                sums = values if sums is None else sums + values
-                weight = batch.num_valid if weight is None else weight + batch.num_valid
+                values = torch.stack([value.double() for value in parts.values()])
+                sums = sums + values * batch.num_valid
+                weight = weight + batch.num_valid
         model.train(was_training)
-        assert sums is not None
-        assert weight is not None
         return dict(zip(names, (sums / weight).tolist(), strict=True))

@@ -18,7 +18,7 @@ from robo_manip_baselines.data.demonstrations import (
     split_episodes,
 )
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
-from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.data.normalization import mean_std
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -139,7 +139,7 @@ def test_statistics_do_not_see_what_is_held_out(folder: Path) -> None:
         split = split_episodes(loaded.seeds, 0.3, 0)
         assert split.validation == (40,)
         rows = loaded.rows(loaded.indices(split.train))
-        return Normalization.of(loaded.state[rows], loaded.action[rows]).to_json()
+        return mean_std(loaded.state[rows], loaded.action[rows]).to_json()
 
     before = statistics(load_demonstrations(folder, BLIND))
     write(folder, 40, 30)

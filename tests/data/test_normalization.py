@@ -9,7 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.data.normalization import SMALLEST_STD, Normalization
+from robo_manip_baselines.data.normalization import (
+    SMALLEST_STD,
+    Normalization,
+    mean_std,
+)
 from robo_manip_baselines.runs.errors import RequestError
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -20,12 +24,12 @@ def measured(rows: int = 40, seed: int = 0) -> tuple[Normalization, np.ndarray, 
     rng = np.random.default_rng(seed)
     state = rng.normal([5.0, -2.0, 0.0], [0.5, 3.0, 1.0], (rows, 3)).astype(np.float32)
     action = rng.uniform(-1.0, 1.0, (rows, 2)).astype(np.float32)
-    return Normalization.of(state, action), state, action
+    return mean_std(state, action), state, action
 
 
 def test_training_rows_come_out_with_mean_0_and_deviation_1() -> None:
     normalization, state, action = measured()
-    for scaled in (normalization.normalized_state(state), normalization.normalized_action(action)):
+    for scaled in (normalization.normalize_state(state), normalization.normalize_action(action)):
         assert scaled.dtype == np.float32
         # float32 arithmetic on numbers of a few units: 1e-6 relative.
         np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=1e-5)
@@ -34,23 +38,23 @@ def test_training_rows_come_out_with_mean_0_and_deviation_1() -> None:
 
 def test_actions_come_back() -> None:
     normalization, _, action = measured()
-    back = normalization.action(normalization.normalized_action(action))
+    back = normalization.unnormalize_action(normalization.normalize_action(action))
     np.testing.assert_allclose(back, action, atol=1e-6)
 
 
 def test_sums_do_not_lose_small_motion_on_a_large_offset() -> None:
     # float32 holds 1000.3 to 6e-5; summed up in float32, the mean would be off by 0.3.
     state = (1000.3 + 0.01 * np.tile([[-1.0] * 2, [1.0] * 2], (50_000, 1))).astype(np.float32)
-    normalization = Normalization.of(state, state)
+    normalization = mean_std(state, state)
     np.testing.assert_allclose(normalization.state_std, 0.01, rtol=1e-2)
 
 
 def test_nearly_constant_elements_are_not_blown_up() -> None:
     state = np.full((10, 2), 0.3, np.float32)
     state[0, 1] += 1e-5
-    normalization = Normalization.of(state, state)
+    normalization = mean_std(state, state)
     np.testing.assert_array_equal(normalization.state_std, np.float32(SMALLEST_STD))
-    assert np.abs(normalization.normalized_state(state)).max() < 0.02
+    assert np.abs(normalization.normalize_state(state)).max() < 0.02
 
 
 @given(st.lists(st.tuples(FINITE, POSITIVE), min_size=1, max_size=6))

@@ -1,13 +1,13 @@
 """Write the golden numbers beside this file: ``python tests/golden/regenerate.py``.
 
-One training step of ACT on a fixed batch, from weights that no random generator draws. Nothing
-else writes these files; look at the difference before you commit it.
+One training step of each network on a fixed batch, from weights that no random generator draws.
+Nothing else writes these files; look at the difference before you commit it.
 """
 
 from __future__ import annotations
 
-import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,15 @@ from torch import Tensor, nn
 
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
-from robo_manip_baselines.policy.interface import Batch, Sizes
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel
+from robo_manip_baselines.policy.mlp.config import MlpConfig
+from robo_manip_baselines.policy.mlp.model import MlpModel
+from robo_manip_baselines.runs.files import write_json
 
 ACT_STEP = Path(__file__).with_name("act_step.json")
+MLP_STEP = Path(__file__).with_name("mlp_step.json")
 
-SIZES = Sizes(state=14, action=7, cameras=2, image=(48, 72))
+DIMS = PolicyDims(state=14, action=7, cameras=2, image=(48, 72))
 CONFIG = {
     "chunk_size": 8,
     "hidden_size": 32,
@@ -70,12 +73,13 @@ def fill_parameters(model: nn.Module) -> None:
             parameter.data = fill(parameter.shape, index, 0.1)
 
 
-def fixed_batch() -> Batch:
+def fixed_batch(has_images: bool) -> Batch:
     """Three examples of 8, 5 and 1 valid steps."""
     is_pad = torch.arange(8)[None] >= torch.tensor([[8], [5], [1]])
+    images = (127.5 + fill((3, 1, 2, 48, 72, 3), 2, 127.5)).to(torch.uint8)
     return Batch(
-        state=fill((3, 14), 1, 1.5),
-        images=(127.5 + fill((3, 2, 48, 72, 3), 2, 127.5)).to(torch.uint8),
+        state=fill((3, 1, 14), 1, 1.5),
+        images=images if has_images else None,
         action=fill((3, 8, 7), 3, 1.5),
         is_pad=is_pad,
         noise=fill((3, 6), 4, 1.5),
@@ -85,15 +89,27 @@ def fixed_batch() -> Batch:
 
 
 def act_step(paper_compat: bool) -> dict[str, Any]:
+    """Return `training_step` of ACT."""
+    model = ActModel(ActConfig(**CONFIG, paper_compat=paper_compat), DIMS)
+    return training_step(model, fixed_batch(has_images=True), WATCHED)
+
+
+def mlp_step() -> dict[str, Any]:
+    """Return `training_step` of the perceptron."""
+    config = MlpConfig(chunk_size=8, hidden_size=32, hidden_layers=2)
+    model = MlpModel(config, replace(DIMS, cameras=0))
+    watched = ("layers.0.weight", "layers.1.bias", "layers.3.weight", "layers.7.weight")
+    return training_step(model, fixed_batch(has_images=False), watched)
+
+
+def training_step(model: PolicyModel, batch: Batch, watch: tuple[str, ...]) -> dict[str, Any]:
     """Losses before and after one step of AdamW; norms of gradients and of weights after it."""
-    model = ActModel(ActConfig(**CONFIG, paper_compat=paper_compat), SIZES)
     fill_parameters(model)
-    batch = fixed_batch()
     optimizer = torch.optim.AdamW(model.parameter_groups(1e-3), weight_decay=1e-4)
     before = model.loss(batch)
     before["loss"].backward()
     parameters = dict(model.named_parameters())
-    watched = [name for name in WATCHED if name in parameters and parameters[name].requires_grad]
+    watched = [name for name in watch if name in parameters and parameters[name].requires_grad]
     gradients = {name: parameters[name].grad for name in watched}
     norms = {name: g.norm().item() for name, g in gradients.items() if g is not None}
     optimizer.step()
@@ -111,8 +127,8 @@ def main() -> None:
         "default": act_step(paper_compat=False),
         "paper_compat": act_step(paper_compat=True),
     }
-    with atomic_file(ACT_STEP) as path:
-        path.write_text(json.dumps(golden, indent=2) + "\n")
+    write_json(ACT_STEP, golden)
+    write_json(MLP_STEP, mlp_step())
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from robo_manip_baselines.policy.checkpoint import (
     write_checkpoint,
 )
 from robo_manip_baselines.policy.mlp.config import MlpConfig
-from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
+from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims, TrainSettings
 from robo_manip_baselines.policy.registry import make_model
 from robo_manip_baselines.runs.checkpoints import checkpoint_folder, step_folder
 from robo_manip_baselines.runs.errors import RequestError
@@ -38,10 +38,10 @@ CHECKPOINT = Checkpoint(
     folder=Path(),
     policy="Mlp",
     config=MlpConfig(chunk_size=2, hidden_size=4, hidden_layers=1, dropout=0.5),
-    sizes=Sizes(state=3, action=2, cameras=0, image=(480, 640)),
+    dims=PolicyDims(state=3, action=2, cameras=0, image=(480, 640)),
     spec=ObservationSpec(obs="current_pred", horizon=3, cameras=(), object_pose=True),
     env="FeedingEnv",
-    acting=Acting(temporal_ensemble=False, execute=3),
+    execution=ActionExecution(temporal_ensemble=False, n_action_steps=3),
     # Numbers that need all digits of float32.
     normalization=Normalization(
         *(np.array(v, np.float32) for v in ([0.1, 1 / 3, -7e-9], [1.1, 1e-3, 2.0], [0, 3], [1, 2]))
@@ -60,7 +60,7 @@ CHECKPOINT = Checkpoint(
 
 def weights() -> dict[str, torch.Tensor]:
     torch.manual_seed(1)
-    return make_model("Mlp", CHECKPOINT.config, CHECKPOINT.sizes).state_dict()
+    return make_model("Mlp", CHECKPOINT.config, CHECKPOINT.dims).state_dict()
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Devices and precisions; seeds; signals; the clock of phases; the picture of the curves."""
+"""Devices and precisions; seeds; signals; the clock of phases; the curves."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from robo_manip_baselines.commands import train as train_command
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import write_curves
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training import device as device_module
+from robo_manip_baselines.training import trainer
+from robo_manip_baselines.training.config import TrainConfig
 from robo_manip_baselines.training.device import (
+    PHASES,
     Processes,
+    StepTimer,
     autocast_type,
     choose_device,
     prepare_device,
 )
-from robo_manip_baselines.training.timing import PHASES, PhaseClock
 
 CPU = torch.device("cpu")
 CUDA = torch.device("cuda", 0)
@@ -85,7 +87,7 @@ def test_devices(
 @pytest.mark.parametrize(
     ("given", "gpus", "message"),
     [
-        ("cuda", 0, "finds no CUDA device; say --device cpu"),
+        ("cuda", 0, "finds no CUDA device; use --device cpu"),
         ("cuda:2", 2, "'cuda:2': there are 2"),
         ("meta", 1, "must be auto, cpu, cuda or cuda:NUMBER"),
         ("gpu", 1, "must be auto, cpu, cuda or cuda:NUMBER"),
@@ -138,11 +140,11 @@ def test_nothing_that_trained_is_left_when_the_processes_part(
 
     monkeypatch.setattr(torch.distributed, "init_process_group", lambda *_: None)
     monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: left.append(made[0]()))
-    monkeypatch.setattr(train_command, "_train", train)
+    monkeypatch.setattr(trainer, "_train", train)
     monkeypatch.setattr(Processes, "from_environment", lambda: Processes(1, 2, 1))
     level = logging.getLogger().level
     try:
-        assert train_command.train(["Mlp", "--preset", "cpu", "--device", "cpu"]) == 0
+        assert trainer.train(TrainConfig.from_preset("Mlp", "cpu", device="cpu")) == 0
     finally:
         logging.getLogger().setLevel(level)
     assert left == [None]
@@ -184,15 +186,15 @@ def test_torchrun_repeats_ctrl_c() -> None:
 def test_phases_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    clock = PhaseClock(CPU)
+    timer = StepTimer(CPU)
     for factor in (1.0, 3.0):
         for phase, seconds in zip(PHASES, (1.0, 2.0, 4.0, 8.0), strict=True):
             now[0] += factor * seconds
-            clock.mark(phase)
+            timer.mark(phase)
         now[0] += 100.0  # a validation
-        clock.skip()
-    assert clock.read() == {"data": 2.0, "forward": 4.0, "backward": 8.0, "optimizer": 16.0}
-    assert clock.read() == dict.fromkeys(PHASES, 0.0)
+        timer.skip()
+    assert timer.read() == {"data": 2.0, "forward": 4.0, "backward": 8.0, "optimizer": 16.0}
+    assert timer.read() == dict.fromkeys(PHASES, 0.0)
 
 
 @pytest.mark.long

@@ -15,8 +15,8 @@ from robo_manip_baselines.data.demonstrations import Demonstrations, load_demons
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.training import images as frames_module
-from robo_manip_baselines.training.images import FrameSource, fit_image, free_memory
+from robo_manip_baselines.training import images as images_module
+from robo_manip_baselines.training.images import ImageStore, fit_image, free_memory
 
 # Not the order in which files keep them.
 CAMERAS = ("top", "angle", "front_close")
@@ -53,7 +53,7 @@ def test_images_are_those_of_the_files(
 ) -> None:
     loaded, images = load(tmp_path, codec, size)
     budget = images.nbytes if is_held else images.nbytes - 1
-    with FrameSource(loaded, memory_budget=budget, threads=3) as source:
+    with ImageStore(loaded, memory_budget=budget, threads=3) as source:
         assert (source.held is not None) == is_held
         assert source.shape == (3, *size, 3)
         rows = np.array([15, 0, 5, 4, 7, 7, 8])
@@ -84,29 +84,29 @@ def test_damage_is_an_error_that_names_the_frame(tmp_path: Path, is_held: bool) 
     message = "episode_000001.hdf5': frame 2 of 'angle' .*checksum is wrong"
     if is_held:
         with pytest.raises(RequestError, match=message):
-            FrameSource(loaded)
+            ImageStore(loaded)
     else:
-        with FrameSource(loaded, memory_budget=0) as source:
+        with ImageStore(loaded, memory_budget=0) as source:
             source.images(np.array([6]))
             with pytest.raises(RequestError, match=message):
                 source.images(np.array([6, 7]))
 
 
-def test_a_picture_that_is_none_names_the_frame(tmp_path: Path) -> None:
+def test_an_image_that_is_none_names_the_frame(tmp_path: Path) -> None:
     images = make_images(4, cameras=CAMERAS)
     images["top"][2] = np.arange(50, dtype=np.uint8)
     path = episode_path(tmp_path, 0, success=True)
     write_episode(path, make_arrays(4), images, make_attributes(0))
     loaded = load_demonstrations(tmp_path, ObservationSpec(cameras=("top",), image_size=(24, 32)))
     with (
-        FrameSource(loaded, memory_budget=0) as source,
-        pytest.raises(RequestError, match="frame 2 of 'top': no picture"),
+        ImageStore(loaded, memory_budget=0) as source,
+        pytest.raises(RequestError, match="frame 2 of 'top': no image"),
     ):
         source.images(np.arange(4))
 
 
 def test_few_files_may_be_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frames_module, "MAX_OPEN_FILES", 2)
+    monkeypatch.setattr(images_module, "MAX_OPEN_FILES", 2)
     opened: list[Path] = []
 
     class Counted(EpisodeReader):
@@ -114,9 +114,9 @@ def test_few_files_may_be_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             super().__init__(path)
             opened.append(path)
 
-    monkeypatch.setattr(frames_module, "EpisodeReader", Counted)
+    monkeypatch.setattr(images_module, "EpisodeReader", Counted)
     loaded, images = load(tmp_path)
-    with FrameSource(loaded, memory_budget=0) as source:
+    with ImageStore(loaded, memory_budget=0) as source:
         for rows in ([0, 6, 1], [7, 2], [9], [8, 3, 6]):
             np.testing.assert_array_equal(source.images(np.array(rows)), images[rows])
     # Episode 2 takes the place of 1, unused for longer than 0; 1 is opened anew, 0 is not.
@@ -128,7 +128,7 @@ def test_many_threads_may_ask(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     asked = [rng.integers(0, sum(LENGTHS), 4) for _ in range(60)]
     with (
-        FrameSource(loaded, memory_budget=0, threads=2) as source,
+        ImageStore(loaded, memory_budget=0, threads=2) as source,
         ThreadPoolExecutor(6) as pool,
     ):
         for rows, got in zip(asked, pool.map(source.images, asked), strict=True):
@@ -139,7 +139,7 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
     loaded, _ = load(tmp_path)
     before = threading.active_count()
     for budget in (0, None):
-        source = FrameSource(loaded, memory_budget=budget)
+        source = ImageStore(loaded, memory_budget=budget)
         source.images(np.arange(9))
         source.close()
         source.close()
@@ -149,7 +149,7 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
 def test_without_cameras_there_is_no_source(tmp_path: Path) -> None:
     load(tmp_path)
     with pytest.raises(RequestError, match="no images without a camera"):
-        FrameSource(load_demonstrations(tmp_path, ObservationSpec(cameras=())))
+        ImageStore(load_demonstrations(tmp_path, ObservationSpec(cameras=())))
 
 
 def test_free_memory_is_known_and_sensible() -> None:

@@ -1,4 +1,4 @@
-"""Batches: what they hold, and that nothing but seed and step decides it."""
+"""Batches: their contents, functions of the seed and of the step alone."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from robo_manip_baselines.data import episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
-from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.policy.interface import Batch
+from robo_manip_baselines.data.normalization import Normalization, mean_std
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
+from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.batching import BatchLoader, part_of
-from robo_manip_baselines.training.images import FrameSource
-from robo_manip_baselines.training.sampling import Schedule, StateNoise
+from robo_manip_baselines.training.images import ImageStore
+from robo_manip_baselines.training.sampling import ExampleSampler, StateNoise
 
 LENGTHS = (6, 9, 4, 7, 5)
 TRAIN = (3, 0, 4)  # not in order: the schedule's episodes are places in this list
@@ -55,13 +55,21 @@ def shown(folder: Path) -> Demonstrations:
 
 def statistics(loaded: Demonstrations) -> Normalization:
     rows = loaded.rows(TRAIN)
-    return Normalization.of(loaded.state[rows], loaded.action[rows])
+    return mean_std(loaded.state[rows], loaded.action[rows])
 
 
 def make_loader(loaded: Demonstrations, sampler: str = "frame", **changes: Any) -> BatchLoader:
-    schedule = Schedule(loaded.lengths[list(TRAIN)], sampler, changes.pop("batch_size", 4), 5)
-    options = {"chunk_size": CHUNK, "noise_size": NOISE, "seed": 5, "device": "cpu", **changes}
-    return BatchLoader(loaded, statistics(loaded), TRAIN, schedule, **options)
+    examples = ExampleSampler(loaded.lengths[list(TRAIN)], sampler, changes.pop("batch_size", 4), 5)
+    sizes = {name: changes.pop(name) for name in ("noise_size", "n_obs_steps") if name in changes}
+    options = {"seed": 5, "device": "cpu", **changes}
+    return BatchLoader(loaded, statistics(loaded), TRAIN, examples, model(**sizes), **options)
+
+
+def model(noise_size: int = NOISE, n_obs_steps: int = 1) -> PolicyModel:
+    """A network of which only the sizes are read."""
+    made = PolicyModel()
+    made.chunk_size, made.noise_size, made.n_obs_steps = CHUNK, noise_size, n_obs_steps
+    return made
 
 
 def assert_equal(one: Batch, other: Batch) -> None:
@@ -73,13 +81,13 @@ def assert_equal(one: Batch, other: Batch) -> None:
             assert torch.equal(a.cpu(), b.cpu()), field.name
 
 
-def test_a_batch_holds_what_the_schedule_says(blind: Demonstrations) -> None:
+def test_a_batch_holds_the_examples_of_the_sampler(blind: Demonstrations) -> None:
     loader, scale = make_loader(blind), statistics(blind)
-    schedule = Schedule(blind.lengths[list(TRAIN)], "frame", 4, 5)
+    sampler = ExampleSampler(blind.lengths[list(TRAIN)], "frame", 4, 5)
     seen_padding = False
-    for step in range(2 * schedule.frames_per_epoch // 4 + 1):
+    for step in range(2 * sampler.frames_per_epoch // 4 + 1):
         batch = loader.batch(step)
-        examples = schedule.batch(step)
+        examples = sampler.batch(step)
         assert batch.images is None
         assert batch.noise.shape == (len(examples), NOISE)
         valid = 0
@@ -87,7 +95,7 @@ def test_a_batch_holds_what_the_schedule_says(blind: Demonstrations) -> None:
             rows = blind.rows([TRAIN[episode]])
             states, actions = blind.state[rows], blind.action[rows]
             state = (states[start] - scale.state_mean) / scale.state_std
-            np.testing.assert_array_equal(batch.state[i].numpy(), state, strict=True)
+            np.testing.assert_array_equal(batch.state[i].numpy(), state[None], strict=True)
             for k in range(CHUNK):
                 is_past = start + k >= len(rows)
                 assert bool(batch.is_pad[i, k]) == is_past
@@ -127,7 +135,7 @@ def test_noise_is_normal_and_new_at_every_step(blind: Demonstrations) -> None:
 
 @pytest.mark.parametrize("world_size", [1, 2, 3, 4])
 def test_processes_share_a_batch_out(blind: Demonstrations, world_size: int) -> None:
-    noise = {"state_noise": StateNoise(blind.spec, robot=0.3)}
+    noise = {"state_noise": StateNoise(blind.spec, ObservedNames(), robot=0.3)}
     whole = make_loader(blind, **noise)
     parts = [
         make_loader(blind, rank=rank, world_size=world_size, **noise) for rank in range(world_size)
@@ -162,16 +170,40 @@ def test_parts_are_contiguous() -> None:
 
 @pytest.mark.parametrize("budget", [0, None])
 def test_images_are_those_of_the_first_step(shown: Demonstrations, budget: int | None) -> None:
-    schedule = Schedule(shown.lengths[list(TRAIN)], "episode", 2, 5)
-    with FrameSource(shown, memory_budget=budget) as frames:
-        loader = make_loader(shown, "episode", batch_size=2, frames=frames)
+    sampler = ExampleSampler(shown.lengths[list(TRAIN)], "episode", 2, 5)
+    with ImageStore(shown, memory_budget=budget) as images:
+        loader = make_loader(shown, "episode", batch_size=2, images=images)
         for step, batch in enumerate(loader.batches(0, 6)):
-            rows = [shown.offsets[TRAIN[e]] + t for e, t in schedule.batch(step)]
+            rows = [shown.offsets[TRAIN[e]] + t for e, t in sampler.batch(step)]
             assert batch.images is not None
-            expected = frames.images(np.array(rows))
+            expected = images.images(np.array(rows))[:, None]
             np.testing.assert_array_equal(batch.images.numpy(), expected, strict=True)
-            channels_first = batch.images[:, 0].permute(0, 3, 1, 2)
+            channels_first = batch.images[:, 0, 0].permute(0, 3, 1, 2)
             assert channels_first.is_contiguous(memory_format=torch.channels_last)
+
+
+@pytest.mark.parametrize("budget", [0, None])
+def test_windows_end_with_the_example_and_begin_in_its_episode(
+    shown: Demonstrations, budget: int | None
+) -> None:
+    """Rows before the start of the episode repeat its first; noise is on every row."""
+    sampler = ExampleSampler(shown.lengths[list(TRAIN)], "frame", 4, 5)
+    with ImageStore(shown, memory_budget=budget) as images:
+        loader = make_loader(shown, images=images, n_obs_steps=3)
+        noise = StateNoise(shown.spec, ObservedNames(), robot=0.3)
+        noisy = make_loader(shown, images=images, n_obs_steps=3, state_noise=noise)
+        for step in range(6):
+            batch = loader.batch(step)
+            assert batch.images is not None
+            assert batch.action.shape[1] == CHUNK
+            for i, (episode, start) in enumerate(sampler.batch(step)):
+                first = shown.offsets[TRAIN[episode]]
+                rows = np.array([first + max(start - past, 0) for past in (2, 1, 0)])
+                state = statistics(shown).normalize_state(shown.state[rows])
+                np.testing.assert_array_equal(batch.state[i].numpy(), state, strict=True)
+                np.testing.assert_array_equal(batch.images[i].numpy(), images.images(rows))
+            drawn = noisy.batch(step).state - batch.state
+            assert len(torch.unique(drawn[..., :14])) > 0.9 * drawn[..., :14].numel()
 
 
 def loading_threads() -> list[str]:
@@ -205,14 +237,14 @@ def test_a_failure_ahead_comes_when_its_batch_is_due(
     blind: Demonstrations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loader = make_loader(blind, depth=6)
-    schedule_batch = Schedule.batch
+    sampler_batch = ExampleSampler.batch
 
-    def batch(self: Schedule, step: int) -> np.ndarray:
+    def batch(self: ExampleSampler, step: int) -> np.ndarray:
         if step == 3:
             raise OSError("the disk is gone")
-        return schedule_batch(self, step)
+        return sampler_batch(self, step)
 
-    monkeypatch.setattr(Schedule, "batch", batch)
+    monkeypatch.setattr(ExampleSampler, "batch", batch)
     batches = loader.batches(0, 9)
     for _ in range(3):
         next(batches)
@@ -225,13 +257,13 @@ def test_no_more_than_depth_batches_are_made_ahead(
     blind: Demonstrations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
-    schedule_batch = Schedule.batch
+    sampler_batch = ExampleSampler.batch
 
-    def batch(self: Schedule, step: int) -> np.ndarray:
+    def batch(self: ExampleSampler, step: int) -> np.ndarray:
         asked.append(step)
-        return schedule_batch(self, step)
+        return sampler_batch(self, step)
 
-    monkeypatch.setattr(Schedule, "batch", batch)
+    monkeypatch.setattr(ExampleSampler, "batch", batch)
     batches = make_loader(blind, depth=2).batches(0, 50)
     for _ in range(5):
         next(batches)
@@ -252,18 +284,17 @@ def test_wrong_arguments(blind: Demonstrations, changes: dict[str, int], message
         make_loader(blind, **changes)
 
 
-def test_schedule_and_frames_must_fit(blind: Demonstrations, shown: Demonstrations) -> None:
-    schedule = Schedule([6, 7, 5], "frame", 4, 5)
-    options = {"chunk_size": CHUNK, "noise_size": NOISE, "seed": 5, "device": "cpu"}
-    with pytest.raises(ValueError, match="schedule is of other episodes"):
-        BatchLoader(blind, statistics(blind), TRAIN, schedule, **options)
+def test_sampler_and_images_must_fit(blind: Demonstrations, shown: Demonstrations) -> None:
+    sampler = ExampleSampler([6, 7, 5], "frame", 4, 5)
+    with pytest.raises(ValueError, match="sampler is of other episodes"):
+        BatchLoader(blind, statistics(blind), TRAIN, sampler, model(), seed=5, device="cpu")
     with pytest.raises(ValueError, match="if, and only if, there are cameras"):
         make_loader(shown)
     with (
-        FrameSource(shown) as frames,
+        ImageStore(shown) as images,
         pytest.raises(ValueError, match="if, and only if, there are cameras"),
     ):
-        make_loader(blind, frames=frames)
+        make_loader(blind, images=images)
 
 
 def copies(loader: BatchLoader, steps: int) -> list[Batch]:
@@ -280,9 +311,9 @@ def copies(loader: BatchLoader, steps: int) -> list[Batch]:
 @cuda
 @pytest.mark.parametrize("budget", [0, None])
 def test_a_gpu_gets_the_same_images(shown: Demonstrations, budget: int | None) -> None:
-    with FrameSource(shown, memory_budget=budget) as frames:
-        here = make_loader(shown, frames=frames, depth=0)
-        there = make_loader(shown, frames=frames, device="cuda")
+    with ImageStore(shown, memory_budget=budget) as images:
+        here = make_loader(shown, images=images, depth=0)
+        there = make_loader(shown, images=images, device="cuda")
         for step, batch in enumerate(copies(there, 60)):
             assert batch.images is not None
             assert batch.images.device.type == batch.num_valid.device.type == "cuda"

@@ -12,7 +12,7 @@ import torch
 
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import MetricsLog, open_board, read_metrics
-from robo_manip_baselines.training.step import RunningMean
+from robo_manip_baselines.training.state import RunningMean
 
 
 class Board:

@@ -12,20 +12,20 @@ from hypothesis import strategies as st
 
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
-from robo_manip_baselines.policy.presets import Sizes, TrainSettings
-from robo_manip_baselines.training.step import (
+from robo_manip_baselines.policy.presets import PolicyDims, TrainSettings
+from robo_manip_baselines.training.optim import (
     WeightAverage,
     learning_rate_factor,
     make_optimizer,
     set_learning_rate,
 )
 
-SIZES = Sizes(state=3, action=2, cameras=0, image=(1, 1))
+DIMS = PolicyDims(state=3, action=2, cameras=0, image=(1, 1))
 
 
 def make_model() -> MlpModel:
     torch.manual_seed(0)
-    return MlpModel(MlpConfig(chunk_size=2, hidden_size=4, hidden_layers=1), SIZES)
+    return MlpModel(MlpConfig(chunk_size=2, hidden_size=4, hidden_layers=1), DIMS)
 
 
 @pytest.mark.parametrize(

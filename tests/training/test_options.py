@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 import yaml
 
+from robo_manip_baselines.commands.train import parse_config
 from robo_manip_baselines.policy.act.config import PRESETS, ActConfig
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.training.options import FREE, TrainOptions, parse_options
-from robo_manip_baselines.training.run_folder import require_same_config
+from robo_manip_baselines.training.config import TrainConfig, require_same_config
 
 
-def parse(line: str, *, has_gpu: bool = False) -> TrainOptions[ActConfig]:
-    return parse_options(line.split(), has_gpu)
+def parse(line: str, *, has_gpu: bool = False) -> TrainConfig[ActConfig]:
+    return parse_config(line.split(), has_gpu)
 
 
 def write(folder: Path, text: str) -> Path:
@@ -115,27 +115,90 @@ def test_one_budget_replaces_the_other(
 )
 def test_saved_options_read_back_as_they_were(tmp_path: Path, line: str) -> None:
     options = parse(line)
-    file = write(tmp_path, yaml.safe_dump(options.to_config()))
-    again = parse(f"{options.policy} --config {file}")
-    assert again.to_config() == options.to_config()
-    assert (again.network, again.training, again.spec) == (
-        options.network,
-        options.training,
-        options.spec,
-    )
+    file = write(tmp_path, yaml.safe_dump(options.to_json()))
+    assert parse(f"{options.policy} --config {file}") == options
 
 
 def test_runs_of_older_releases_are_the_same_runs(tmp_path: Path) -> None:
     """Their config.yaml knows of no corruption but ``error: none``."""
-    config = parse("Mlp").to_config()
+    values = parse("Mlp").to_json()
     new = ("error_stats", "delay", "face_dropout", "face_dropout_length", "detector_rate")
-    old = {name: value for name, value in config.items() if name not in (*new, "corruption_seed")}
+    dropped = (*new, "corruption_seed", "out")
+    old = {name: value for name, value in values.items() if name not in dropped}
     assert old["error"] == "none"
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(old))
-    require_same_config(tmp_path, config, FREE)
-    for changed in ("--delay 2", "--no_corruption --delay 2", "--error uniform"):
+    for same in ("", "--no_corruption --delay 2"):
+        require_same_config(tmp_path, parse(f"Mlp {same}"))
+    for changed in ("--delay 2", "--error uniform"):
         with pytest.raises(RequestError, match="holds a run with"):
-            require_same_config(tmp_path, parse(f"Mlp {changed}").to_config(), FREE)
+            require_same_config(tmp_path, parse(f"Mlp {changed}"))
+
+
+def test_the_previous_releases_file_resumes(tmp_path: Path) -> None:
+    """Written by release 0.1.0 for ``Act --preset cpu --error uniform --delay 3 --steps 9``."""
+    text = """\
+policy: Act
+chunk_size: 30
+hidden_size: 128
+feedforward_size: 512
+num_heads: 4
+encoder_layers: 1
+decoder_layers: 1
+state_layers: 2
+latent_size: 32
+cvae_layers: 1
+use_cvae: true
+kl_weight: 10.0
+dropout: 0.0
+pre_norm: false
+backbone_learning_rate_factor: 1.0
+backbone_weights: null
+paper_compat: false
+batch_size: 64
+learning_rate: 0.001
+weight_decay: 0.0001
+schedule: cosine
+warmup_steps: 100
+clip_norm: 0.0
+sampler: frame
+epochs: null
+steps: 9
+state_noise: 0.2
+clock_noise: 0.5
+validation_fraction: 0.0
+ema_decay: 0.999
+precision: auto
+compile: false
+obs: current_pred
+horizon: 2
+error: uniform
+error_stats: null
+delay: 3
+face_dropout: null
+face_dropout_length: null
+detector_rate: null
+corruption_seed: null
+env: FeedingEnv
+dataset: null
+num_episodes: null
+preset: cpu
+cameras:
+- none
+image_size: 480x640
+object_pose: true
+arms: right
+seed: 0
+device: auto
+logger: tensorboard
+log_every: 50
+validate_every: 500
+checkpoint_every: 1000
+"""
+    (tmp_path / "config.yaml").write_text(text)
+    given = parse("Act --preset cpu --error uniform --delay 3 --steps 9")
+    resumed = parse(f"Act --out {tmp_path} --resume")
+    assert resumed.to_json() == {**given.to_json(), "out": str(tmp_path)}
+    require_same_config(tmp_path, given)
 
 
 def test_dropout_of_the_network_is_not_that_of_the_face() -> None:
@@ -175,8 +238,8 @@ def test_run_folders(line: str, folder: str) -> None:
 @pytest.mark.parametrize(
     ("line", "parts"),
     [
-        ("", ["say first which policy", "Act, Mlp"]),
-        ("--preset cpu Act", ["say first which policy"]),
+        ("", ["name the policy to train first", "Act, Mlp"]),
+        ("--preset cpu Act", ["name the policy to train first"]),
         ("act", ["unknown policy 'act'", "mean 'Act'"]),
         ("Act --preset papre", ["unknown preset 'papre'", "mean 'paper'", "valid: cpu, paper"]),
         ("Act --chunk_siez 3", ["'--chunk_siez'", "mean '--chunk_size'"]),

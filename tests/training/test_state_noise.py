@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.observation.state import vector_names
-from robo_manip_baselines.training.sampling import StateNoise, noise_of
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
+from robo_manip_baselines.training.sampling import StateNoise, step_noise
 
 SPEC = ObservationSpec(obs="current_pred", horizon=3, cameras=(), object_pose=True)
+NAMES = ObservedNames(objects=("cube",))
 
 
 def drawn(noise: StateNoise) -> torch.Tensor:
@@ -19,8 +19,8 @@ def drawn(noise: StateNoise) -> torch.Tensor:
 
 
 def test_it_is_where_it_belongs() -> None:
-    added = drawn(StateNoise(SPEC, robot=0.3, clock=0.5))
-    for index, name in enumerate(vector_names(SPEC)):
+    added = drawn(StateNoise(SPEC, NAMES, robot=0.3, clock=0.5))
+    for index, name in enumerate(SPEC.vector_names(NAMES)):
         expected = 0.3 if index < 14 else 0.5 * name.startswith("t_")
         # 3200 numbers: the deviation strays by 1.25 % of itself; five times that.
         assert added[..., index].std().item() == pytest.approx(expected, rel=0.0625), name
@@ -28,15 +28,15 @@ def test_it_is_where_it_belongs() -> None:
 
 
 def test_there_is_one_clock() -> None:
-    times = [i for i, name in enumerate(vector_names(SPEC)) if name.startswith("t_")]
-    shown = drawn(StateNoise(SPEC, robot=0.3, clock=0.5))[..., times]
+    times = [i for i, name in enumerate(SPEC.vector_names(NAMES)) if name.startswith("t_")]
+    shown = drawn(StateNoise(SPEC, NAMES, robot=0.3, clock=0.5))[..., times]
     assert len(times) == 4
     assert torch.equal(shown, shown[..., :1].expand_as(shown))
-    assert (drawn(StateNoise(SPEC, robot=0.3))[..., times] == 0.0).all()
+    assert (drawn(StateNoise(SPEC, NAMES, robot=0.3))[..., times] == 0.0).all()
 
 
 def test_it_is_a_function_of_seed_and_step() -> None:
-    noise, again = StateNoise(SPEC, 0.3, 0.5), StateNoise(SPEC, 0.3, 0.5)
+    noise, again = StateNoise(SPEC, NAMES, 0.3, 0.5), StateNoise(SPEC, NAMES, 0.3, 0.5)
     first, same = noise.draw(7, 3, 5), again.draw(7, 3, 5)
     assert first is not None
     assert same is not None
@@ -45,12 +45,12 @@ def test_it_is_a_function_of_seed_and_step() -> None:
         other = noise.draw(seed, step, 5)
         assert other is not None
         assert not torch.equal(first, other)
-    assert not torch.equal(noise_of(7, "state", 3, 5, 15), noise_of(7, "noise", 3, 5, 15))
+    assert not torch.equal(step_noise(7, "state", 3, 5, 15), step_noise(7, "noise", 3, 5, 15))
 
 
 @pytest.mark.parametrize("obs", ["baseline", "current"])
 def test_nothing_to_add_is_none(obs: str) -> None:
     spec = ObservationSpec(obs=obs, cameras=())
-    assert StateNoise(spec).draw(0, 0, 4) is None
-    assert StateNoise(spec, clock=0.5).draw(0, 0, 4) is None  # no clock is shown
-    assert StateNoise(spec, robot=0.1).draw(0, 0, 4) is not None
+    assert StateNoise(spec, NAMES).draw(0, 0, 4) is None
+    assert StateNoise(spec, NAMES, clock=0.5).draw(0, 0, 4) is None  # no clock is shown
+    assert StateNoise(spec, NAMES, robot=0.1).draw(0, 0, 4) is not None

@@ -1,4 +1,4 @@
-"""``bin/Train.py`` from outside: signals, resuming, several processes, what it says."""
+"""``bin/Train.py`` from outside: signals, resuming, several processes, output."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.commands.train import train
+from robo_manip_baselines.commands.train import main as train
+from robo_manip_baselines.commands.train import parse_config
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import read_metrics
+from robo_manip_baselines.training.config import TrainConfig
 from robo_manip_baselines.training.requirements import prepare_pytorch
+from robo_manip_baselines.training.trainer import train as train_config
 
 pytestmark = pytest.mark.long
 
@@ -62,7 +65,7 @@ def weights(run: Path) -> bytes:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_says_how_to_go_on(
+def test_a_signal_saves_and_names_the_next_command(
     number: signal.Signals, line: str, repository: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
@@ -71,7 +74,7 @@ def test_a_signal_saves_and_says_how_to_go_on(
     process.send_signal(number)
     _, errors = process.communicate(timeout=TIMEOUT)
     assert process.returncode == 130
-    assert f"go on with: python bin/Train.py Mlp --out {run} --resume" in errors
+    assert f"continue with: python bin/Train.py Mlp --out {run} --resume" in errors
     assert "Traceback" not in errors
     [(step, _)] = list_checkpoints(run)
     assert f"stopped at step {step}" in errors
@@ -236,3 +239,30 @@ def test_tensorboard_has_the_scalars(line: str, tmp_path: Path) -> None:
     events.Reload()
     assert [x.step for x in events.Scalars("train/loss")] == [5, 10]
     assert [x.step for x in events.Scalars("validation/loss")] == [10]
+
+
+def test_help_is_quick_and_without_pytorch(repository: Path) -> None:
+    program = (
+        "import sys, time; start = time.perf_counter();\n"
+        "from robo_manip_baselines.commands.train import main\n"
+        "try:\n    main(['--help'])\n"
+        "except SystemExit:\n    print(time.perf_counter() - start, 'torch' in sys.modules)"
+    )
+    process = subprocess.run(
+        [sys.executable, "-c", program], cwd=repository, capture_output=True, text=True, check=True
+    )
+    seconds, has_torch = process.stdout.splitlines()[-1].split()
+    assert has_torch == "False"
+    assert "--learning_rate" in process.stdout
+    assert float(seconds) < 15.0  # 0.8 s on an idle machine; importing PyTorch takes several
+
+
+def test_a_run_from_python_is_that_of_the_command(episodes: Path, tmp_path: Path) -> None:
+    """`TrainConfig` and `train` without a command line."""
+    args = f"Mlp {TINY} --dataset {episodes} --steps 6"
+    assert train(f"{args} --out {tmp_path / 'typed'}".split()) == 0
+    config = parse_config(args.split())
+    config = TrainConfig.from_json({**config.to_json(), "out": str(tmp_path / "built")})
+    assert train_config(config, resume=True) == 0
+    assert weights(tmp_path / "built") == weights(tmp_path / "typed")
+    assert losses(tmp_path / "built") == losses(tmp_path / "typed")

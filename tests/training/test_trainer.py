@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,19 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from robo_manip_baselines.commands.train import parse_config
 from robo_manip_baselines.policy.act import resnet as backbone
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics
+from robo_manip_baselines.runs.metrics import read_metrics
+from robo_manip_baselines.training import trainer as trainer_module
+from robo_manip_baselines.training.config import METRICS, TrainConfig
 from robo_manip_baselines.training.device import Processes
-from robo_manip_baselines.training.options import parse_options
-from robo_manip_baselines.training.run_folder import METRICS
-from robo_manip_baselines.training.setup import Job
-from robo_manip_baselines.training.trainer import Outcome, Parts, Trainer, assembled
+from robo_manip_baselines.training.images import ImageStore
+from robo_manip_baselines.training.setup import TrainSetup
+from robo_manip_baselines.training.trainer import Trainer, train
 
 pytestmark = pytest.mark.long
 
@@ -57,24 +60,43 @@ def narrow_backbone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backbone, "WIDTHS", (8, 8, 8, 8))
 
 
-def run(line: str, episodes: Path, out: Path, stop_at: int | None = None) -> Outcome:
-    """Train in this process, from the newest checkpoint on, until after step ``stop_at``."""
-    intervals = "--log_every 3 --validate_every 4 --checkpoint_every 100"
+def configure(line: str, episodes: Path, out: Path) -> TrainConfig[Any]:
+    """Return the configuration of a short run."""
+    intervals = "--log_every 3 --validate_every 4 --checkpoint_every 100 --logger none"
     args = f"{line.split()[0]} {intervals} --steps {STEPS} --dataset {episodes} --out {out} "
     args += line.partition(" ")[2]  # may override the intervals
-    job = Job.of(parse_options(args.split(), has_gpu=False))
-    start = read_checkpoint(out) if list_checkpoints(out) else None
-    first = start.step if start else 0
-    out.mkdir(parents=True, exist_ok=True)
-    steps = itertools.count(first + 1)
-    with (
-        MetricsLog(out / METRICS, first, None) as log,
-        assembled(job, start, CPU, Processes()) as parts,
-    ):
-        trainer = Trainer(
-            job, parts, log=log, processes=Processes(), stop=lambda: next(steps) == stop_at
-        )
-        return trainer.train()
+    return parse_config(args.split(), has_gpu=False)
+
+
+class StopAt:
+    """A request to stop that is made after a step."""
+
+    def __init__(self, step: int | None) -> None:
+        self._before = -1 if step is None else step
+
+    @property
+    def is_made(self) -> bool:
+        """Asked once after each step."""
+        self._before -= 1
+        return self._before == 0
+
+
+def run(line: str, episodes: Path, out: Path, stop_at: int | None = None) -> int:
+    """Train in this process, from the newest checkpoint on, until after step ``stop_at``."""
+    done = list_checkpoints(out)[-1][0] if list_checkpoints(out) else 0
+    with pytest.MonkeyPatch.context() as patch:
+        stop = StopAt(None if stop_at is None else stop_at - done)
+        patch.setattr(trainer_module, "StopRequest", lambda **_: nullcontext(stop))
+        code = train(configure(line, episodes, out), resume=True)
+    assert code == (0 if stop_at is None else EXIT_INTERRUPTED)
+    return list_checkpoints(out)[-1][0]
+
+
+def make_trainer(line: str, episodes: Path, out: Path) -> Trainer:
+    """Return a trainer at its beginning, which writes nothing."""
+    setup = TrainSetup.load(configure(line, episodes, out))
+    images = ImageStore(setup.demonstrations) if setup.dims.cameras else None
+    return Trainer(setup, None, CPU, Processes(), images=images)
 
 
 def contents(out: Path) -> dict[str, Any]:
@@ -100,9 +122,8 @@ def test_resuming_is_exact(name: str, episodes: Path, tmp_path: Path) -> None:
     run(RUNS[name], episodes, tmp_path / "whole")
     # 4: in the middle of a window of metrics and after a validation; 9: at the end of a window
     for stop_at in (4, 9):
-        outcome = run(RUNS[name], episodes, tmp_path / "parts", stop_at=stop_at)
-        assert outcome.step == stop_at
-    assert run(RUNS[name], episodes, tmp_path / "parts").step == STEPS
+        assert run(RUNS[name], episodes, tmp_path / "parts", stop_at=stop_at) == stop_at
+    assert run(RUNS[name], episodes, tmp_path / "parts") == STEPS
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
@@ -134,22 +155,20 @@ def test_metrics_are_means_of_the_steps(episodes: Path, tmp_path: Path) -> None:
     assert [x["step"] for x in written] == [3, 6, 9, 10]
 
     # The same training with one plain loop.
-    args = f"{line} --steps {STEPS} --dataset {episodes} --out {tmp_path / 'loop'}"
-    job = Job.of(parse_options(args.split(), has_gpu=False))
-    with assembled(job, None, CPU, Processes()) as parts:
-        model, settings = parts.train_step.model, job.options.training
-        optimizer = torch.optim.AdamW(
-            model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-        )
-        losses = []
-        for step in range(STEPS):
-            factor = 0.5 * (1 + math.cos(math.pi * step / STEPS))
-            optimizer.param_groups[0]["lr"] = settings.learning_rate * factor
-            optimizer.zero_grad()
-            loss = model.loss(parts.loader.batch(step))["loss"]
-            loss.backward()
-            optimizer.step()
-            losses.append(loss.item())
+    trainer = make_trainer(line, episodes, tmp_path / "loop")
+    model, settings = trainer.state.model, configure(line, episodes, tmp_path).training
+    optimizer = torch.optim.AdamW(
+        model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    )
+    losses = []
+    for step in range(STEPS):
+        factor = 0.5 * (1 + math.cos(math.pi * step / STEPS))
+        optimizer.param_groups[0]["lr"] = settings.learning_rate * factor
+        optimizer.zero_grad()
+        loss = model.loss(trainer.loader.batch(step))["loss"]
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
     expected = [np.mean(losses[a:b]) for a, b in ((0, 3), (3, 6), (6, 9), (9, 10))]
     # fused and plain AdamW round differently, and metrics keep seven digits
     assert [x["loss"] for x in written] == pytest.approx(expected, rel=1e-5)
@@ -165,53 +184,57 @@ def test_the_average_is_what_is_saved_and_validated(episodes: Path, tmp_path: Pa
     model = load_model(checkpoint)
     name, weight = next(iter(model.named_parameters()))
     assert not torch.equal(weight, tensors[f"weights/{name}"])
-    args = f"{RUNS['average, cosine, warm-up, clipped']} --steps {STEPS} --dataset {episodes}"
-    job = Job.of(parse_options(args.split(), has_gpu=False))
-    with assembled(job, None, CPU, Processes()) as parts:
-        assert parts.validation is not None
-        losses = parts.validation(model)
-        assert losses == parts.validation(model)  # the same draws every time
+    trainer = make_trainer(RUNS["average, cosine, warm-up, clipped"], episodes, tmp_path)
+    assert trainer.held_out is not None
+    losses = trainer.held_out(model)
+    assert losses == trainer.held_out(model)  # the same draws every time
     last = [x for x in read_metrics(tmp_path / METRICS) if x["kind"] == "validation"][-1]
     assert last["loss"] == pytest.approx(losses["loss"], rel=1e-6)  # seven digits are written
 
 
-def test_every_step_enters_the_average(episodes: Path, tmp_path: Path) -> None:
-    args = f"{MLP} --ema_decay 0.3 --steps 8 --dataset {episodes} --out {tmp_path}"
-    job = Job.of(parse_options(args.split(), has_gpu=False))
-    with assembled(job, None, CPU, Processes()) as parts:
-        train_step = parts.train_step
-        expected = [p.detach().double() for p in train_step.model.parameters()]
-        for step in range(8):
-            train_step(parts.loader.batch(step), step)
-            decay = min(0.3, (1 + step) / (10 + step))
-            expected = [
-                decay * mean + (1 - decay) * now.detach().double()
-                for mean, now in zip(expected, train_step.model.parameters(), strict=True)
-            ]
-        for mean, value in zip(expected, train_step.result.parameters(), strict=True):
-            # eight float32 roundings of weights below 1
-            np.testing.assert_allclose(value.double(), mean, rtol=1e-5, atol=1e-7)
+def test_every_step_enters_the_average(
+    episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trainer_module, "KEPT_CHECKPOINTS", STEPS)
+    line = f"{MLP} --ema_decay 0.3 --checkpoint_every 1"
+    first = make_trainer(line, episodes, tmp_path).state.model.state_dict()
+    expected = {name: value.double() for name, value in first.items()}
+    run(line, episodes, tmp_path)
+    for step, (_, folder) in enumerate(list_checkpoints(tmp_path)):
+        decay = min(0.3, (1 + step) / (10 + step))
+        tensors = load_file(folder / "trainer.safetensors")
+        averages = load_file(folder / "model.safetensors")
+        for name, value in averages.items():
+            now = tensors[f"weights/{name}"].double()
+            expected[name] = decay * expected[name] + (1 - decay) * now
+            # at most ten float32 roundings of weights below 1
+            np.testing.assert_allclose(value.double(), expected[name], rtol=1e-5, atol=1e-7)
+    assert step == STEPS - 1
 
 
 def test_validation_is_without_dropout(episodes: Path, tmp_path: Path) -> None:
-    args = f"{PLAIN} --steps 1 --dataset {episodes} --out {tmp_path}"
-    job = Job.of(parse_options(args.split(), has_gpu=False))
-    with assembled(job, None, CPU, Processes()) as parts:
-        assert parts.validation is not None
-        model = parts.train_step.model.train()
-        losses = parts.validation(model)
-        assert model.training
-        assert parts.validation(model.eval()) == losses
+    trainer = make_trainer(PLAIN, episodes, tmp_path)
+    assert trainer.held_out is not None
+    model = trainer.state.model.train()
+    losses = trainer.held_out(model)
+    assert model.training
+    assert trainer.held_out(model.eval()) == losses
 
 
 def test_every_step_drops_other_units(episodes: Path, tmp_path: Path) -> None:
-    args = f"{MLP} --learning_rate 1e-20 --steps 5 --dataset {episodes} --out {tmp_path}"
-    job = Job.of(parse_options(args.split(), has_gpu=False))
-    with assembled(job, None, CPU, Processes()) as parts:
-        batch = parts.loader.batch(0)
-        losses = [parts.train_step(batch, step)["loss"].item() for step in (0, 1, 2, 0)]
-    assert len(set(losses)) == 3
-    assert losses[0] == losses[3]
+    """A batch is all frames and no step learns: the losses differ by dropout alone."""
+    line = f"{PLAIN} --validation_fraction 0 --batch_size 39 --learning_rate 1e-20 --log_every 1"
+    spread = {}
+    for dropout in ("0", "0.2"):
+        line_of = line.replace("--dropout 0.2", f"--dropout {dropout} --state_noise 0")
+        run(f"{line_of} --clock_noise 0", episodes, tmp_path / dropout)
+        lines = read_metrics(tmp_path / dropout / METRICS)
+        losses = [x["loss"] for x in lines if x["kind"] == "train"]
+        assert len(losses) == STEPS
+        spread[dropout] = np.diff(sorted(losses))
+    assert spread["0"].max() < 1e-5  # float32 sums in another order
+    assert spread["0.2"].max() > 1e-3
+    assert np.count_nonzero(spread["0.2"]) == STEPS - 1
 
 
 def test_a_loss_that_is_not_finite_stops_in_one_line(episodes: Path, tmp_path: Path) -> None:
@@ -230,14 +253,14 @@ def test_weights_that_are_not_finite_are_not_saved(episodes: Path, tmp_path: Pat
 def test_initial_weights_may_be_gone_when_resuming(
     episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: list[Any] = []
-    real = Job.make_model
+    made: list[bool] = []
+    real = TrainSetup.make_model
 
-    def spy(self: Job, is_start: bool) -> Any:
-        made.append(is_start)
-        return real(self, is_start)
+    def spy(self: TrainSetup, *, initial_weights: bool = True) -> Any:
+        made.append(initial_weights)
+        return real(self, initial_weights=initial_weights)
 
-    monkeypatch.setattr(Job, "make_model", spy)
+    monkeypatch.setattr(TrainSetup, "make_model", spy)
     run(RUNS["latent noise"], episodes, tmp_path, stop_at=2)
     run(RUNS["latent noise"], episodes, tmp_path)
     assert made == [True, False]
@@ -245,20 +268,14 @@ def test_initial_weights_may_be_gone_when_resuming(
 
 def test_gradients_have_the_layout_of_their_weights(episodes: Path, tmp_path: Path) -> None:
     """Fused AdamW reads weight, gradient and moments as flat memory."""
-    args = f"{RUNS['images']} --steps {STEPS} --dataset {episodes} --out {tmp_path}"
-    job = Job.of(parse_options(args.split(), has_gpu=False))
-    with assembled(job, None, CPU, Processes()) as parts:
-        check_layouts(parts)
-
-
-def check_layouts(parts: Parts) -> None:
-    step, seen = parts.train_step, 0
-    step.model.loss(parts.loader.batch(0))["loss"].backward()
-    for parameter in step.model.parameters():
+    trainer, seen = make_trainer(RUNS["images"], episodes, tmp_path), 0
+    state = trainer.state
+    state.model.loss(trainer.loader.batch(0))["loss"].backward()
+    for parameter in state.model.parameters():
         if parameter.grad is not None:
             assert parameter.grad.stride() == parameter.stride()
             seen += parameter.ndim == 4 and not parameter.is_contiguous()
-    step.optimizer.step()
-    for parameter, state in step.optimizer.state.items():
-        assert state["exp_avg"].stride() == parameter.stride()
+    state.optimizer.step()
+    for parameter, moments in state.optimizer.state.items():
+        assert moments["exp_avg"].stride() == parameter.stride()
     assert seen, "no convolution has its weights in channels_last"

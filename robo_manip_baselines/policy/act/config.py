@@ -1,27 +1,23 @@
-"""Settings of ACT. Importing this needs no PyTorch."""
+"""Settings and presets of ACT. Importing this needs no PyTorch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from robo_manip_baselines.policy.presets import WITHOUT_IMAGES, Acting, PolicyPreset, TrainSettings
-from robo_manip_baselines.runs.errors import RequestError
-
-_COUNTS = (
-    "chunk_size",
-    "hidden_size",
-    "feedforward_size",
-    "num_heads",
-    "encoder_layers",
-    "decoder_layers",
-    "latent_size",
-    "cvae_layers",
+from robo_manip_baselines.policy.presets import (
+    STATE_ONLY_TRAINING,
+    ActionExecution,
+    PolicyPreset,
+    TrainSettings,
+    require_at_least,
+    require_proportion,
 )
+from robo_manip_baselines.runs.errors import RequestError
 
 
 @dataclass(frozen=True)
 class ActConfig:
-    """What the network is (Zhao et al. 2023, "ACT"; the paper's Table III).
+    """Architecture of the network (Zhao et al. 2023, "ACT"; the paper's Table III).
 
     Attributes:
         chunk_size: K, actions predicted at once (Table III: 100).
@@ -33,8 +29,8 @@ class ActConfig:
         decoder_layers: of the Transformer over the K queries (public ACT: 7, of which it reads
             the first; see ``paper_compat``).
         state_layers: hidden layers, as wide as ``feedforward_size``, of the perceptron that makes
-            the token of the state (public ACT: 0, one linear layer). Without pictures that token
-            is all there is to see; ``docs/act.md`` says what hidden layers changed.
+            the token of the state (public ACT: 0, one linear layer). Without images that token
+            is the only observation; ``docs/act.md`` has the effect of hidden layers.
         latent_size: Z, numbers of the latent style variable (public ACT: 32).
         cvae_layers: of the Transformer over class token, state and actions that proposes the
             latent in training (public ACT: 4).
@@ -49,8 +45,8 @@ class ActConfig:
         backbone_weights: file with the state dict of a torchvision ResNet-18 to start from,
             ``.safetensors`` or ``.pth``; None starts from random weights.
         paper_compat: compute what the public ACT code computes: actions are read off the first
-            decoder layer, padded steps count in the denominator of the L1 loss, and nothing tells
-            cameras apart. Otherwise the last layer, valid steps only, and a learned embedding for
+            decoder layer, padded steps count in the denominator of the L1 loss, and cameras have
+            no embedding. Otherwise the last layer, valid steps only, and a learned embedding for
             each camera.
 
     Raises:
@@ -75,19 +71,13 @@ class ActConfig:
     paper_compat: bool = False
 
     def __post_init__(self) -> None:
-        for name in _COUNTS:
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
-        if self.state_layers < 0:
-            raise RequestError(f"state_layers {self.state_layers}: must be 0 or more")
+        require_at_least(1, self, "chunk_size", "hidden_size", "feedforward_size", "num_heads")
+        require_at_least(1, self, "encoder_layers", "decoder_layers", "latent_size", "cvae_layers")
+        require_at_least(0, self, "state_layers", "kl_weight", "backbone_learning_rate_factor")
+        require_proportion(self, "dropout")
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
-        for name in ("kl_weight", "backbone_learning_rate_factor"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise RequestError(f"{name} {getattr(self, name)}: must be 0 or more, and finite")
-        if not 0.0 <= self.dropout < 1.0:
-            raise RequestError(f"dropout {self.dropout}: must be 0 or more, less than 1")
 
 
 PRESETS = {
@@ -100,7 +90,7 @@ PRESETS = {
             epochs=2000,
             validation_fraction=0.0,  # the paper trains on all 50
         ),
-        acting=Acting(temporal_ensemble=True, decay=0.01),
+        execution=ActionExecution(temporal_ensemble=True, ensemble_decay=0.01),
     ),
     "cpu": PolicyPreset(
         config=ActConfig(
@@ -114,8 +104,8 @@ PRESETS = {
             cvae_layers=1,
             dropout=0.0,
         ),
-        training=WITHOUT_IMAGES,
-        acting=Acting(temporal_ensemble=True),
+        training=STATE_ONLY_TRAINING,
+        execution=ActionExecution(temporal_ensemble=True),
         cameras=(),
         object_pose=True,
     ),

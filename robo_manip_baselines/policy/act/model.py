@@ -1,6 +1,8 @@
-"""Where a token is: sines of its place in a sequence or in a picture.
+"""The network of ACT: action chunking with Transformers (Zhao et al. 2023).
 
-Legend: L tokens of a sequence, D hidden size, H and W height and width of a feature map.
+Legend: B batch, L query tokens, M tokens of the memory, D hidden size, G attention heads, E size of
+a head, K actions of a chunk, S elements of the state, A elements of an action, N cameras, H and W
+image height and width, h and w those of a feature map, Z latent size.
 """
 
 from __future__ import annotations
@@ -18,14 +20,14 @@ from robo_manip_baselines.policy.act.resnet import (
     fold_for_inference,
     load_backbone,
 )
-from robo_manip_baselines.policy.interface import Batch, PolicyModel, Sizes, masked_mean
+from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel, masked_mean
 
 TEMPERATURE = 10_000.0
 """Longest wavelength over the shortest (Vaswani et al. 2017; DETR)."""
 
 
 def sine_positions(length: int, size: int) -> Tensor:
-    """Return (L, D) sines and cosines, alternating, of the places 0 ... L - 1.
+    """Return (L, D) sinusoidal position embeddings of the places 0 ... L - 1.
 
     Args:
         length: L.
@@ -35,14 +37,14 @@ def sine_positions(length: int, size: int) -> Tensor:
 
 
 def sine_positions_2d(height: int, width: int, size: int) -> Tensor:
-    """Return (H * W, D) positions of the cells of a feature map, row by row.
+    """Return (h * w, D) position embeddings of the cells of a feature map, row by row.
 
     The first half of D is the row, the second the column, both scaled to (0, 2 pi], as in DETR:
     a cell keeps its position when the resolution changes.
 
     Args:
-        height: H.
-        width: W.
+        height: h.
+        width: w.
         size: D, a multiple of 4.
     """
     rows = _waves(torch.arange(1, height + 1, dtype=torch.float64) * (math.tau / height), size // 2)
@@ -67,7 +69,7 @@ _LEVELS = 1 << 16
 
 
 class Dropout(nn.Module):
-    """Sets elements to 0 in training and scales the others so that the mean stays.
+    """Dropout that draws 16 random bits an element on a CPU, a quarter of what PyTorch draws.
 
     Randomness comes from PyTorch's default generator of the device.
 
@@ -93,12 +95,12 @@ class Dropout(nn.Module):
         return x * kept.mul_(_LEVELS / (_LEVELS - dropped))
 
     def extra_repr(self) -> str:
-        """Return what `print` shows of it."""
+        """Return the settings that `print` shows."""
         return f"{self.probability}"
 
 
 class Linear(nn.Linear):
-    """A linear layer that takes what comes in to the type of its weights, where that is smaller."""
+    """A linear layer that casts its input to the type of its weights, where that is smaller."""
 
     def forward(self, input: Tensor) -> Tensor:
         """Return (..., out_features)."""
@@ -108,7 +110,7 @@ class Linear(nn.Linear):
 
 
 class ExactLinear(nn.Linear):
-    """A linear layer in fp32 also under autocast: at the ends, where numbers are positions.
+    """A linear layer in fp32 also under autocast, for both ends, where numbers are positions.
 
     bf16 keeps 8 bits: of a joint that moves by a radian, steps of several milliradians.
     """
@@ -136,10 +138,10 @@ class Attention(nn.Module):
         """Return (B, L, D).
 
         Args:
-            query_BLD: tokens that ask, with their positions.
-            key_BMD: tokens that are asked, with their positions.
-            value_BMD: the same tokens without.
-            keep_BM: bool, False for tokens that must not be seen; None to see all.
+            query_BLD: queries, with their positions.
+            key_BMD: keys, with their positions.
+            value_BMD: values: the same tokens without.
+            keep_BM: bool, False for tokens to mask out; None for no mask.
         """
         mask = None if keep_BM is None else keep_BM[:, None, None, :]
         attended_BGLE = nn.functional.scaled_dot_product_attention(
@@ -155,7 +157,7 @@ class Attention(nn.Module):
 
 
 class LayerNorm(nn.LayerNorm):
-    """Layer normalisation in fp32, whatever comes in."""
+    """Layer normalisation in fp32 for inputs of any type."""
 
     def forward(self, input: Tensor) -> Tensor:
         """Return fp32 of the same shape."""
@@ -165,10 +167,11 @@ class LayerNorm(nn.LayerNorm):
 
 
 class FeedForward(nn.Module):
-    """Two linear layers with a rectifier and dropout between them, on every token."""
+    """Two linear layers with ReLU and dropout between them, on every token."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__()
+        # Names of parameters are those of checkpoints: widen, narrow, memory_attention.
         self.widen = Linear(config.hidden_size, config.feedforward_size)
         self.dropout = Dropout(config.dropout)
         self.narrow = Linear(config.feedforward_size, config.hidden_size)
@@ -179,7 +182,7 @@ class FeedForward(nn.Module):
 
 
 class Residual(nn.Module):
-    """Adds what a block makes of the tokens to the tokens; normalises before or after."""
+    """Residual connection around a block, with layer normalisation before or after it."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__()
@@ -188,11 +191,11 @@ class Residual(nn.Module):
         self.dropout = Dropout(config.dropout)
 
     def before(self, x_BLD: Tensor) -> Tensor:
-        """Return what the block sees."""
+        """Return the block's input."""
         return self.norm(x_BLD) if self.pre_norm else x_BLD
 
     def after(self, x_BLD: Tensor, change_BLD: Tensor) -> Tensor:
-        """Return the tokens with the block's change."""
+        """Return the tokens plus the block's output."""
         x_BLD = x_BLD + self.dropout(change_BLD)
         return x_BLD if self.pre_norm else self.norm(x_BLD)
 
@@ -209,11 +212,11 @@ class EncoderLayer(nn.Module):
 
     def forward(self, x_BLD: Tensor, position_LD: Tensor, keep_BL: Tensor | None) -> Tensor:
         """Return (B, L, D)."""
-        seen = self.attention_residual.before(x_BLD)
-        placed = seen + position_LD
-        x_BLD = self.attention_residual.after(x_BLD, self.attention(placed, placed, seen, keep_BL))
-        seen = self.feed_forward_residual.before(x_BLD)
-        return self.feed_forward_residual.after(x_BLD, self.feed_forward(seen))
+        inner = self.attention_residual.before(x_BLD)
+        query = inner + position_LD
+        x_BLD = self.attention_residual.after(x_BLD, self.attention(query, query, inner, keep_BL))
+        inner = self.feed_forward_residual.before(x_BLD)
+        return self.feed_forward_residual.after(x_BLD, self.feed_forward(inner))
 
 
 class Encoder(nn.Module):
@@ -231,7 +234,7 @@ class Encoder(nn.Module):
         Args:
             x_BLD: tokens.
             position_LD: added to queries and keys of every layer.
-            keep_BL: bool, False for tokens that must not be seen; None to see all.
+            keep_BL: bool, False for tokens to mask out; None for no mask.
         """
         for layer in self.layers:
             x_BLD = layer(x_BLD, position_LD, keep_BL)
@@ -239,7 +242,7 @@ class Encoder(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """Self-attention of the queries, attention to the memory, feed-forward."""
+    """Self-attention of the queries, cross-attention to the memory, feed-forward."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__()
@@ -251,21 +254,21 @@ class DecoderLayer(nn.Module):
         self.feed_forward_residual = Residual(config)
 
     def forward(
-        self, x_BLD: Tensor, position_LD: Tensor, memory_BMD: Tensor, placed_memory_BMD: Tensor
+        self, x_BLD: Tensor, position_LD: Tensor, memory_BMD: Tensor, memory_key_BMD: Tensor
     ) -> Tensor:
         """Return (B, L, D)."""
-        seen = self.attention_residual.before(x_BLD)
-        placed = seen + position_LD
-        x_BLD = self.attention_residual.after(x_BLD, self.attention(placed, placed, seen))
-        placed = self.memory_residual.before(x_BLD) + position_LD
-        found = self.memory_attention(placed, placed_memory_BMD, memory_BMD)
+        inner = self.attention_residual.before(x_BLD)
+        query = inner + position_LD
+        x_BLD = self.attention_residual.after(x_BLD, self.attention(query, query, inner))
+        query = self.memory_residual.before(x_BLD) + position_LD
+        found = self.memory_attention(query, memory_key_BMD, memory_BMD)
         x_BLD = self.memory_residual.after(x_BLD, found)
-        seen = self.feed_forward_residual.before(x_BLD)
-        return self.feed_forward_residual.after(x_BLD, self.feed_forward(seen))
+        inner = self.feed_forward_residual.before(x_BLD)
+        return self.feed_forward_residual.after(x_BLD, self.feed_forward(inner))
 
 
 class Decoder(nn.Module):
-    """A stack of decoder layers, of which perhaps only the first are run."""
+    """A stack of decoder layers, of which only the first ``num_run`` are used."""
 
     def __init__(self, config: ActConfig, num_layers: int, num_run: int) -> None:
         super().__init__()
@@ -280,15 +283,15 @@ class Decoder(nn.Module):
         """Return (B, L, D), fp32.
 
         Args:
-            query_LD: what stands for the place of each output; the tokens themselves start at 0.
+            query_LD: learned queries, one for each output; the tokens themselves start at 0.
             memory_BMD: tokens of the encoder.
             position_MD: their positions.
         """
         x_BLD = query_LD.new_zeros((memory_BMD.shape[0], *query_LD.shape))
         # The positions of the memory are the same in every layer: added once.
-        placed_memory_BMD = memory_BMD + position_MD
+        memory_key_BMD = memory_BMD + position_MD
         for layer in self.layers[: self.num_run]:
-            x_BLD = layer(x_BLD, query_LD, memory_BMD, placed_memory_BMD)
+            x_BLD = layer(x_BLD, query_LD, memory_BMD, memory_key_BMD)
         return self.norm(x_BLD)
 
 
@@ -301,16 +304,16 @@ def _initialize(module: nn.Module) -> None:
 
 
 class CvaeEncoder(nn.Module):
-    """Proposes a distribution of the latent from the state and the demonstrated actions."""
+    """Encoder of the CVAE: distribution of the latent given state and demonstrated actions."""
 
     positions: Tensor
 
-    def __init__(self, config: ActConfig, sizes: Sizes) -> None:
+    def __init__(self, config: ActConfig, dims: PolicyDims) -> None:
         super().__init__()
         width = config.hidden_size
         self.class_token = nn.Parameter(torch.randn(1, width))
-        self.state_projection = ExactLinear(sizes.state, width)
-        self.action_projection = ExactLinear(sizes.action, width)
+        self.state_projection = ExactLinear(dims.state, width)
+        self.action_projection = ExactLinear(dims.action, width)
         self.encoder = Encoder(config, config.cvae_layers)
         self.latent_projection = ExactLinear(width, 2 * config.latent_size)
         self.register_buffer(
@@ -323,7 +326,7 @@ class CvaeEncoder(nn.Module):
         Args:
             state: (B, S).
             action: (B, K, A), finite also where ``is_pad``.
-            is_pad: (B, K) bool, actions that are not seen.
+            is_pad: (B, K) bool, actions to mask out.
         """
         batch = state.shape[0]
         tokens = torch.cat(
@@ -347,48 +350,44 @@ def kl_divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
 
 
 class ActModel(PolicyModel):
-    """The whole network.
+    """ACT. It observes the last step only (``n_obs_steps`` 1).
 
     Initial weights are drawn from PyTorch's default generator: seed it for a run that can be
     repeated.
-
-    Attributes:
-        chunk_size: K.
-        noise_size: Z, or 0 without the latent.
 
     Raises:
         RequestError: ``backbone_weights`` without cameras, or not those of a ResNet-18.
     """
 
-    def __init__(self, config: ActConfig, sizes: Sizes) -> None:
+    def __init__(self, config: ActConfig, dims: PolicyDims) -> None:
         super().__init__()
         width = config.hidden_size
         self.config = config
         self.chunk_size = config.chunk_size
         self.noise_size = config.latent_size if config.use_cvae else 0
-        self.cvae = CvaeEncoder(config, sizes) if config.use_cvae else None
+        self.cvae = CvaeEncoder(config, dims) if config.use_cvae else None
         self.latent_projection = ExactLinear(config.latent_size, width)
-        self.state_projection = _state_projection(config, sizes)
+        self.state_projection = _state_projection(config, dims)
         # Learned positions of latent and state, of unit variance like those of the sines.
         self.token_positions = nn.Parameter(torch.randn(2, width))
-        self.vision = Vision(config, sizes) if sizes.cameras else None
+        self.vision = Vision(config, dims) if dims.cameras else None
         self.encoder = Encoder(config, config.encoder_layers)
         self.queries = nn.Parameter(torch.randn(config.chunk_size, width))
         self.decoder = Decoder(
             config, config.decoder_layers, 1 if config.paper_compat else config.decoder_layers
         )
-        self.action_head = ExactLinear(width, sizes.action)
+        self.action_head = ExactLinear(width, dims.action)
         if config.backbone_weights is not None:
             load_backbone(self.vision and self.vision.backbone, config.backbone_weights)
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss``, the sum of ``l1`` and weighted ``kl``, and these two."""
-        # Whatever stands in padded steps, infinities too, must not reach a sum.
+        # The content of padded steps, infinities too, must not reach a sum.
         action = torch.where(batch.is_pad[..., None], 0.0, batch.action)
         kl = batch.state.new_zeros(())
         latent = None
         if self.cvae is not None:
-            mean, log_variance = self.cvae(batch.state, action, batch.is_pad)
+            mean, log_variance = self.cvae(batch.state[:, -1], action, batch.is_pad)
             latent = mean + (0.5 * log_variance).exp() * batch.noise
             kl = kl_divergence(mean, log_variance).sum() / batch.num_examples
         actions = self._actions(batch.state, batch.images, latent)
@@ -400,7 +399,7 @@ class ActModel(PolicyModel):
             l1 = masked_mean(error, batch.is_pad, batch.num_valid)
         return {"loss": l1 + self.config.kl_weight * kl, "l1": l1, "kl": kl}
 
-    def predict(self, state: Tensor, images: Tensor | None) -> Tensor:
+    def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return normalised actions (B, K, A) for the mean of the latent's prior, 0."""
         return self._actions(state, images, None)
 
@@ -435,7 +434,8 @@ class ActModel(PolicyModel):
         return groups
 
     def _actions(self, state: Tensor, images: Tensor | None, latent: Tensor | None) -> Tensor:
-        """(B, K, A) float32 from (B, S), (B, N, H, W, 3) and (B, Z), None being 0."""
+        """(B, K, A) float32 from (B, 1, S), (B, 1, N, H, W, 3) and (B, Z), None being 0."""
+        state = state[:, -1]
         if latent is None:
             latent = state.new_zeros((state.shape[0], self.config.latent_size))
         tokens = [
@@ -444,34 +444,33 @@ class ActModel(PolicyModel):
         ]
         positions: list[Tensor] = [self.token_positions]
         if self.vision is not None:
-            seen, places = self.vision(images)
-            tokens.append(seen)
-            positions.append(places)
+            image_tokens, image_positions = self.vision(images)
+            tokens.append(image_tokens)
+            positions.append(image_positions)
         position_MD = torch.cat(positions)
         memory_BMD = self.encoder(torch.cat(tokens, dim=1), position_MD)
         return self.action_head(self.decoder(self.queries, memory_BMD, position_MD))
 
 
-def _state_projection(config: ActConfig, sizes: Sizes) -> nn.Module:
-    """From the state (B, S) to its token (B, D)."""
+def _state_projection(config: ActConfig, dims: PolicyDims) -> nn.Module:
+    """Build the layers from the state (B, S) to its token (B, D)."""
     layers: list[nn.Module] = []
-    size = sizes.state
+    size, hidden = dims.state, config.feedforward_size
     for _ in range(config.state_layers):
-        wide = config.feedforward_size
-        layers += [ExactLinear(size, wide), nn.LayerNorm(wide), nn.GELU()]
-        size = wide
+        layers += [ExactLinear(size, hidden), nn.LayerNorm(hidden), nn.GELU()]
+        size = hidden
     last = ExactLinear(size, config.hidden_size)
     return nn.Sequential(*layers, last) if layers else last
 
 
 class Vision(nn.Module):
-    """From the pictures of all cameras to tokens."""
+    """ResNet-18 features of the images of all cameras, as tokens."""
 
     positions: Tensor
 
-    def __init__(self, config: ActConfig, sizes: Sizes) -> None:
+    def __init__(self, config: ActConfig, dims: PolicyDims) -> None:
         super().__init__()
-        self.shape = (sizes.cameras, *sizes.image, 3)
+        self.shape = (dims.cameras, *dims.image, 3)
         self.backbone = ResNet18()
         if config.backbone_learning_rate_factor == 0.0:
             self.backbone.requires_grad_(False)
@@ -479,12 +478,12 @@ class Vision(nn.Module):
         self.cameras = (
             None
             if config.paper_compat
-            else nn.Parameter(torch.randn(sizes.cameras, 1, config.hidden_size))
+            else nn.Parameter(torch.randn(dims.cameras, 1, config.hidden_size))
         )
         self.register_buffer(
             "positions",
-            sine_positions_2d(*feature_size(sizes.image), config.hidden_size).repeat(
-                sizes.cameras, 1, 1
+            sine_positions_2d(*feature_size(dims.image), config.hidden_size).repeat(
+                dims.cameras, 1, 1
             ),
             persistent=False,
         )
@@ -493,13 +492,14 @@ class Vision(nn.Module):
         """Return tokens (B, N h w, D) fp32 and their positions (N h w, D).
 
         Raises:
-            ValueError: the images are not (B, N, H, W, 3).
+            ValueError: the images are not (B, 1, N, H, W, 3).
         """
-        if images is None or tuple(images.shape[1:]) != self.shape:
-            given = None if images is None else tuple(images.shape[1:])
+        given = None if images is None else tuple(images.shape[2:])
+        if images is None or given != self.shape:
             raise ValueError(f"images of {self.shape} are needed for each example, not {given}")
-        # One pass over the pictures of all cameras and examples.
+        images = images[:, -1]
+        # One pass over the images of all cameras and examples.
         features = self.projection(self.backbone(images.flatten(0, 1)))
         tokens = features.flatten(2).transpose(1, 2).unflatten(0, images.shape[:2]).flatten(1, 2)
-        places = self.positions if self.cameras is None else self.positions + self.cameras
-        return tokens.float(), places.flatten(0, 1)
+        positions = self.positions if self.cameras is None else self.positions + self.cameras
+        return tokens.float(), positions.flatten(0, 1)

@@ -20,7 +20,7 @@ STRIDE = 32
 """Pixels of the image to a cell of the last feature map."""
 
 WIDTHS = (64, 128, 256, 512)
-"""Channels of the feature maps of the four stages; the last one's is what comes out."""
+"""Channels of the feature maps of the four stages; the last one's are its features."""
 
 BLOCKS_PER_STAGE = 2
 
@@ -74,16 +74,17 @@ def _fold(conv: nn.Conv2d, norm: FrozenBatchNorm) -> tuple[Tensor, Tensor]:
 class BasicBlock(nn.Module):
     """Two 3x3 convolutions beside a shortcut."""
 
-    def __init__(self, wide: int, narrow: int, stride: int) -> None:
+    def __init__(self, channels_in: int, channels_out: int, stride: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(wide, narrow, 3, stride, 1, bias=False)
-        self.bn1 = FrozenBatchNorm(narrow)
-        self.conv2 = nn.Conv2d(narrow, narrow, 3, 1, 1, bias=False)
-        self.bn2 = FrozenBatchNorm(narrow)
+        self.conv1 = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
+        self.bn1 = FrozenBatchNorm(channels_out)
+        self.conv2 = nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False)
+        self.bn2 = FrozenBatchNorm(channels_out)
         self.downsample: nn.Sequential | None = None
-        if stride != 1 or wide != narrow:
+        if stride != 1 or channels_in != channels_out:
             self.downsample = nn.Sequential(
-                nn.Conv2d(wide, narrow, 1, stride, bias=False), FrozenBatchNorm(narrow)
+                nn.Conv2d(channels_in, channels_out, 1, stride, bias=False),
+                FrozenBatchNorm(channels_out),
             )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -97,14 +98,14 @@ class BasicBlock(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """From pictures to a feature map (He et al. 2016).
+    """ResNet-18 from images to a feature map (He et al. 2016).
 
-    Random weights are drawn as torchvision draws them (Kaiming, by what goes out). Without batch
+    Random weights are drawn as torchvision draws them (Kaiming, fan-out). Without batch
     statistics the sum of a block and its shortcut doubles the variance, but each strided stage
     halves it, so that activations grow fivefold over the whole network and need no other remedy.
 
     Attributes:
-        features: channels that come out.
+        features: channels of the feature map.
     """
 
     mean: Tensor
@@ -114,13 +115,15 @@ class ResNet18(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(3, WIDTHS[0], 7, 2, 3, bias=False)
         self.bn1 = FrozenBatchNorm(WIDTHS[0])
-        wide = WIDTHS[0]
-        for stage, narrow in enumerate(WIDTHS, start=1):
-            blocks = [BasicBlock(wide, narrow, 1 if stage == 1 else 2)]
-            blocks += [BasicBlock(narrow, narrow, 1) for _ in range(BLOCKS_PER_STAGE - 1)]
+        channels_in = WIDTHS[0]
+        for stage, channels_out in enumerate(WIDTHS, start=1):
+            blocks = [BasicBlock(channels_in, channels_out, 1 if stage == 1 else 2)]
+            blocks += [
+                BasicBlock(channels_out, channels_out, 1) for _ in range(BLOCKS_PER_STAGE - 1)
+            ]
             self.add_module(f"layer{stage}", nn.Sequential(*blocks))
-            wide = narrow
-        self.features = wide
+            channels_in = channels_out
+        self.features = channels_in
         self.register_buffer("mean", 255.0 * torch.tensor(MEAN)[:, None, None], persistent=False)
         self.register_buffer(
             "scale", 1.0 / (255.0 * torch.tensor(STD))[:, None, None], persistent=False
@@ -130,8 +133,8 @@ class ResNet18(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return (I, 512, h, w) for (I, H, W, 3) uint8 pictures."""
-        # (H, W, 3) pictures seen as (3, H, W) are in the channels-last order already.
+        """Return (I, 512, h, w) for (I, H, W, 3) uint8 images."""
+        # (H, W, 3) images seen as (3, H, W) are in the channels-last order already.
         x = (images.permute(0, 3, 1, 2) - self.mean) * self.scale
         x = convolve(x.to(self.conv1.weight.dtype), self.conv1, self.bn1)
         # Rectifying after the maximum gives the same numbers and has a quarter of them to do.
@@ -154,7 +157,7 @@ def fold_for_inference(backbone: ResNet18) -> None:
 
 
 def feature_size(image: tuple[int, int]) -> tuple[int, int]:
-    """Return (h, w) of the feature map of an (H, W) picture."""
+    """Return (h, w) of the feature map of an (H, W) image."""
     return -(-image[0] // STRIDE), -(-image[1] // STRIDE)
 
 

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from robo_manip_baselines.policy.presets import WITHOUT_IMAGES, Acting, PolicyPreset
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.policy.presets import (
+    STATE_ONLY_TRAINING,
+    ActionExecution,
+    PolicyPreset,
+    require_at_least,
+    require_proportion,
+)
 
 
 @dataclass(frozen=True)
 class MlpConfig:
-    """What the perceptron is.
+    """Architecture of the perceptron.
 
     Attributes:
         chunk_size: K, actions predicted at once.
         hidden_size: width of each hidden layer.
-        hidden_layers: how many there are.
+        hidden_layers: number of hidden layers.
         dropout: before the last layer.
 
     Raises:
@@ -28,18 +33,15 @@ class MlpConfig:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("chunk_size", "hidden_size", "hidden_layers"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
-        if not 0.0 <= self.dropout < 1.0:
-            raise RequestError(f"dropout {self.dropout}: must be 0 or more, less than 1")
+        require_at_least(1, self, "chunk_size", "hidden_size", "hidden_layers")
+        require_proportion(self, "dropout")
 
 
 PRESETS = {
     "cpu": PolicyPreset(
         config=MlpConfig(),
-        training=replace(WITHOUT_IMAGES, batch_size=256),
-        acting=Acting(temporal_ensemble=False, execute=10),
+        training=replace(STATE_ONLY_TRAINING, batch_size=256),
+        execution=ActionExecution(temporal_ensemble=False, n_action_steps=10),
         cameras=(),
         object_pose=True,
     )

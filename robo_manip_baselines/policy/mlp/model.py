@@ -1,4 +1,4 @@
-"""Behaviour cloning with a perceptron: the smallest whole policy, and the pattern for the next.
+"""Behaviour cloning with a perceptron: the smallest complete policy.
 
 Legend: B batch, S elements of the state, K actions of a chunk, A elements of an action.
 """
@@ -9,37 +9,34 @@ import itertools
 
 from torch import Tensor, nn
 
-from robo_manip_baselines.policy.interface import Batch, PolicyModel, Sizes, masked_mean
+from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel, masked_mean
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.runs.errors import RequestError
 
 
 class MlpModel(PolicyModel):
-    """State in, chunk of actions out, L1 loss."""
+    """Perceptron from the state to a chunk of actions, with an L1 loss."""
 
-    def __init__(self, config: MlpConfig, sizes: Sizes) -> None:
+    def __init__(self, config: MlpConfig, dims: PolicyDims) -> None:
         super().__init__()
-        if sizes.cameras:
-            raise RequestError("Mlp sees no images; say --cameras none --object_pose")
+        if dims.cameras:
+            raise RequestError("Mlp takes no images; choose --cameras none --object_pose")
         self.chunk_size = config.chunk_size
-        widths = [sizes.state, *[config.hidden_size] * config.hidden_layers]
+        sizes = [dims.state, *[config.hidden_size] * config.hidden_layers]
         layers: list[nn.Module] = []
-        for wide, narrow in itertools.pairwise(widths):
-            layers += [nn.Linear(wide, narrow), nn.LayerNorm(narrow), nn.GELU()]
-        layers += [
-            nn.Dropout(config.dropout),
-            nn.Linear(widths[-1], self.chunk_size * sizes.action),
-        ]
+        for size_in, size_out in itertools.pairwise(sizes):
+            layers += [nn.Linear(size_in, size_out), nn.LayerNorm(size_out), nn.GELU()]
+        layers += [nn.Dropout(config.dropout), nn.Linear(sizes[-1], self.chunk_size * dims.action)]
         self.layers = nn.Sequential(*layers)
 
-    def predict(self, state: Tensor, images: Tensor | None) -> Tensor:
-        """Return normalised actions (B, K, A) for a (B, S) state."""
-        return self.layers(state).float().unflatten(-1, (self.chunk_size, -1))
+    def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
+        """Return normalised actions (B, K, A) for the last of (B, 1, S) states."""
+        return self.layers(state[:, -1]).float().unflatten(-1, (self.chunk_size, -1))
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the mean absolute error over valid steps as ``loss`` and ``l1``."""
         error = nn.functional.l1_loss(
-            self.predict(batch.state, batch.images), batch.action, reduction="none"
+            self.predict(batch.state, batch.images, None), batch.action, reduction="none"
         )
         l1 = masked_mean(error, batch.is_pad, batch.num_valid)
         return {"loss": l1, "l1": l1}

@@ -12,7 +12,7 @@ import torch
 from robo_manip_baselines.policy.act import resnet as backbone
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
-from robo_manip_baselines.policy.interface import Batch, Sizes
+from robo_manip_baselines.policy.interface import Batch, PolicyDims
 
 CONFIG = ActConfig(
     chunk_size=6,
@@ -25,7 +25,7 @@ CONFIG = ActConfig(
     cvae_layers=2,
     dropout=0.0,
 )
-SIZES = Sizes(state=5, action=3, cameras=2, image=(40, 70))
+DIMS = PolicyDims(state=5, action=3, cameras=2, image=(40, 70))
 
 
 @pytest.fixture
@@ -35,10 +35,10 @@ def make_model(monkeypatch: pytest.MonkeyPatch) -> Callable[..., ActModel]:
     # Multiples of 8: with fewer, oneDNN of PyTorch 2.13 corrupts memory on AVX2 processors.
     monkeypatch.setattr(backbone, "WIDTHS", (8, 8, 8, 16))
 
-    def make(sizes: Sizes = SIZES, **settings: Any) -> ActModel:
+    def make(dims: PolicyDims = DIMS, **settings: Any) -> ActModel:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(7)
-            return ActModel(replace(CONFIG, **settings), sizes)
+            return ActModel(replace(CONFIG, **settings), dims)
 
     return make
 
@@ -47,17 +47,17 @@ def make_model(monkeypatch: pytest.MonkeyPatch) -> Callable[..., ActModel]:
 def make_batch() -> Callable[..., Batch]:
     """Draw a batch in which the examples are of different lengths."""
 
-    def make(sizes: Sizes = SIZES, batch: int = 3, chunk: int = 6, latent: int = 4) -> Batch:
+    def make(dims: PolicyDims = DIMS, batch: int = 3, chunk: int = 6, latent: int = 4) -> Batch:
         generator = torch.Generator().manual_seed(11)
         lengths = torch.arange(batch) * 2 + 1
         is_pad = torch.arange(chunk)[None] >= lengths[:, None]
         images = torch.randint(
-            0, 256, (batch, sizes.cameras, *sizes.image, 3), generator=generator, dtype=torch.uint8
+            0, 256, (batch, 1, dims.cameras, *dims.image, 3), generator=generator, dtype=torch.uint8
         )
         return Batch(
-            state=torch.randn(batch, sizes.state, generator=generator),
-            images=images if sizes.cameras else None,
-            action=torch.randn(batch, chunk, sizes.action, generator=generator),
+            state=torch.randn(batch, 1, dims.state, generator=generator),
+            images=images if dims.cameras else None,
+            action=torch.randn(batch, chunk, dims.action, generator=generator),
             is_pad=is_pad,
             noise=torch.randn(batch, latent, generator=generator),
             num_valid=(~is_pad).sum().float(),

@@ -17,32 +17,32 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
 from robo_manip_baselines.policy.act.resnet import ResNet18
-from robo_manip_baselines.policy.interface import Batch, Sizes
+from robo_manip_baselines.policy.interface import Batch, PolicyDims
 from robo_manip_baselines.runs.errors import RequestError
 
-BLIND = Sizes(state=5, action=3, cameras=0, image=(40, 70))
+BLIND = PolicyDims(state=5, action=3, cameras=0, image=(40, 70))
 
 
 @pytest.mark.parametrize(
-    ("sizes", "settings", "total", "trained"),
+    ("dims", "settings", "total", "trained"),
     [
-        (Sizes(14, 7, 3, (480, 640)), {}, 83_916_935, 83_916_935),
-        (Sizes(29, 7, 3, (480, 640)), {}, 83_932_295, 83_932_295),
-        (Sizes(14, 7, 0, (480, 640)), {}, 72_485_831, 72_485_831),
-        (Sizes(29, 7, 0, (480, 640)), {}, 72_501_191, 72_501_191),
+        (PolicyDims(14, 7, 3, (480, 640)), {}, 83_916_935, 83_916_935),
+        (PolicyDims(29, 7, 3, (480, 640)), {}, 83_932_295, 83_932_295),
+        (PolicyDims(14, 7, 0, (480, 640)), {}, 72_485_831, 72_485_831),
+        (PolicyDims(29, 7, 0, (480, 640)), {}, 72_501_191, 72_501_191),
         # Public ACT, two arms of 7 joints: 83,923,087 with an output that it never uses (513).
-        (Sizes(14, 14, 3, (480, 640)), {"paper_compat": True}, 83_922_574, 51_613_582),
-        (Sizes(14, 7, 3, (480, 640)), {"paper_compat": True}, 83_915_399, 51_606_407),
-        (Sizes(29, 7, 3, (480, 640)), {"paper_compat": True}, 83_930_759, 51_621_767),
-        (Sizes(14, 7, 3, (480, 640)), {"use_cvae": False}, 66_539_079, 66_539_079),
+        (PolicyDims(14, 14, 3, (480, 640)), {"paper_compat": True}, 83_922_574, 51_613_582),
+        (PolicyDims(14, 7, 3, (480, 640)), {"paper_compat": True}, 83_915_399, 51_606_407),
+        (PolicyDims(29, 7, 3, (480, 640)), {"paper_compat": True}, 83_930_759, 51_621_767),
+        (PolicyDims(14, 7, 3, (480, 640)), {"use_cvae": False}, 66_539_079, 66_539_079),
     ],
 )
 def test_how_many_parameters_there_are(
-    sizes: Sizes, settings: dict[str, Any], total: int, trained: int
+    dims: PolicyDims, settings: dict[str, Any], total: int, trained: int
 ):
     # The totals of docs/act.md.
     with torch.device("meta"):  # counted without numbers
-        model = ActModel(ActConfig(**settings), sizes)
+        model = ActModel(ActConfig(**settings), dims)
     assert sum(p.numel() for p in model.parameters()) == total
     assert sum(p.numel() for p in model.parameters() if p.requires_grad) == trained
 
@@ -50,7 +50,7 @@ def test_how_many_parameters_there_are(
 def numpy_losses(model: ActModel, batch: Batch, compat: bool) -> tuple[float, float]:
     """The two parts of the loss, from their definitions."""
     assert model.cvae is not None
-    mean, log_variance = model.cvae(batch.state, batch.action, batch.is_pad)
+    mean, log_variance = model.cvae(batch.state[:, -1], batch.action, batch.is_pad)
     latent = mean + torch.exp(log_variance / 2) * batch.noise
     found = model._actions(batch.state, batch.images, latent).detach().numpy().astype(float)
     error = np.abs(found - batch.action.numpy())
@@ -120,9 +120,9 @@ def test_every_valid_action_changes_the_loss(make_model, make_batch):
 def test_what_is_trained_has_a_gradient_and_the_rest_has_none(
     make_model, make_batch, settings: dict[str, Any], cameras: int
 ):
-    sizes = Sizes(5, 3, cameras, (40, 70))
-    model = make_model(sizes, **settings)
-    found = gradients(model, make_batch(sizes, latent=model.noise_size))
+    dims = PolicyDims(5, 3, cameras, (40, 70))
+    model = make_model(dims, **settings)
+    found = gradients(model, make_batch(dims, latent=model.noise_size))
     assert found.keys() == {n for n, p in model.named_parameters() if p.requires_grad}
     assert all(torch.isfinite(gradient).all() for gradient in found.values())
 
@@ -143,7 +143,7 @@ def test_noise_is_what_the_network_asks_for(make_model, make_batch):
 def test_the_prediction_is_that_of_the_latent_0(make_model, make_batch):
     model, batch = make_model(), make_batch()
     expected = model._actions(batch.state, batch.images, torch.zeros(3, 4))
-    assert torch.equal(model.predict(batch.state, batch.images), expected)
+    assert torch.equal(model.predict(batch.state, batch.images, None), expected)
     other = model._actions(batch.state, batch.images, torch.ones(3, 4))
     assert not torch.allclose(other, expected)
 
@@ -153,7 +153,7 @@ def test_the_paper_compatible_actions_are_those_of_the_first_layer(make_model, m
     assert len(model.decoder.layers) == 3
     found = {}
     model.encoder.register_forward_hook(lambda _m, given, result: found.update(e=(given, result)))
-    actions = model.predict(batch.state, batch.images)
+    actions = model.predict(batch.state, batch.images, None)
     (_, places), memory = found["e"]
     first = model.decoder.layers[0](torch.zeros(3, 6, 16), model.queries, memory, memory + places)
     assert torch.equal(actions, model.action_head(model.decoder.norm(first)))
@@ -161,50 +161,52 @@ def test_the_paper_compatible_actions_are_those_of_the_first_layer(make_model, m
 
 def test_by_default_every_layer_matters(make_model, make_batch):
     model, batch = make_model(BLIND), make_batch(BLIND)
-    before = model.predict(batch.state, None)
+    before = model.predict(batch.state, None, None)
     for layer in model.decoder.layers:
         layer.feed_forward.narrow.weight.data *= -1.0
-        after = model.predict(batch.state, None)
+        after = model.predict(batch.state, None, None)
         assert not torch.allclose(after, before)
         before = after
 
 
 def test_cameras_are_told_apart(make_model, make_batch):
     batch = make_batch()
-    swapped = batch.images.flip(1)
+    swapped = batch.images.flip(2)
     model = make_model()
     assert not torch.allclose(
-        model.predict(batch.state, batch.images), model.predict(batch.state, swapped), atol=1e-4
+        model.predict(batch.state, batch.images, None),
+        model.predict(batch.state, swapped, None),
+        atol=1e-4,
     )
     # In the public code they are not: to attention, tokens are a set.
     compat = make_model(paper_compat=True)
     torch.testing.assert_close(
-        compat.predict(batch.state, batch.images),
-        compat.predict(batch.state, swapped),
+        compat.predict(batch.state, batch.images, None),
+        compat.predict(batch.state, swapped, None),
         atol=1e-5,
         rtol=1e-5,
     )
 
 
-def test_the_place_in_the_picture_matters(make_model, make_batch):
+def test_the_place_in_the_image_matters(make_model, make_batch):
     batch = make_batch()
     model = make_model(paper_compat=True)
     assert not torch.allclose(
-        model.predict(batch.state, batch.images),
-        model.predict(batch.state, batch.images.flip(3)),
+        model.predict(batch.state, batch.images, None),
+        model.predict(batch.state, batch.images.flip(4), None),
         atol=1e-4,
     )
 
 
 @pytest.mark.parametrize("cameras", [0, 2])
 def test_examples_are_independent(make_model, make_batch, cameras: int):
-    sizes = Sizes(5, 3, cameras, (40, 70))
-    model, batch = make_model(sizes).eval(), make_batch(sizes)
-    together = model.predict(batch.state, batch.images)
+    dims = PolicyDims(5, 3, cameras, (40, 70))
+    model, batch = make_model(dims).eval(), make_batch(dims)
+    together = model.predict(batch.state, batch.images, None)
     for b in range(3):
         images = None if batch.images is None else batch.images[b : b + 1]
-        alone = model.predict(batch.state[b : b + 1], images)
-        # Other sizes of matrices are summed in another order.
+        alone = model.predict(batch.state[b : b + 1], images, None)
+        # Other dims of matrices are summed in another order.
         torch.testing.assert_close(alone[0], together[b], atol=1e-5, rtol=1e-5)
 
 
@@ -213,17 +215,19 @@ def test_examples_are_independent(make_model, make_batch, cameras: int):
 def test_any_image_size_and_number_of_cameras(
     make_model, make_batch, image: tuple[int, int], cameras: int
 ):
-    sizes = Sizes(5, 3, cameras, image)
-    model, batch = make_model(sizes), make_batch(sizes)
-    assert model.predict(batch.state, batch.images).shape == (3, 6, 3)
+    dims = PolicyDims(5, 3, cameras, image)
+    model, batch = make_model(dims), make_batch(dims)
+    assert model.predict(batch.state, batch.images, None).shape == (3, 6, 3)
     assert torch.isfinite(model.loss(batch)["loss"])
 
 
-@pytest.mark.parametrize("given", [None, (3, 2, 70, 40, 3), (3, 1, 40, 70, 3), (3, 2, 3, 40, 70)])
+@pytest.mark.parametrize(
+    "given", [None, (3, 1, 2, 70, 40, 3), (3, 1, 1, 40, 70, 3), (3, 1, 2, 3, 40, 70)]
+)
 def test_images_of_another_shape_are_refused(make_model, make_batch, given):
     images = None if given is None else torch.zeros(given, dtype=torch.uint8)
     with pytest.raises(ValueError, match=r"images of \(2, 40, 70, 3\) are needed"):
-        make_model().predict(make_batch().state, images)
+        make_model().predict(make_batch().state, images, None)
 
 
 class Recorder(TorchDispatchMode):
@@ -243,15 +247,15 @@ class Recorder(TorchDispatchMode):
 def test_a_step_waits_for_no_number(make_model, make_batch, cameras: int, settings: dict[str, Any]):
     # On a GPU each of these would halt the queue until what came before is done.
     waiting = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "unique", "is_nonzero"}
-    sizes = Sizes(5, 3, cameras, (40, 70))
-    model, batch = make_model(sizes, **settings), make_batch(sizes)
+    dims = PolicyDims(5, 3, cameras, (40, 70))
+    model, batch = make_model(dims, **settings), make_batch(dims)
     with Recorder() as found:
         model.loss(batch)["loss"].backward()
-        model.predict(batch.state, batch.images)
+        model.predict(batch.state, batch.images, None)
     assert "aten::addmm" in found.names  # it does record
     assert not found.names & {f"aten::{name}" for name in waiting}
     with Recorder() as found:
-        batch.state[0, 0].item()
+        batch.state[0, 0, 0].item()
     assert found.names & {f"aten::{name}" for name in waiting}
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from robo_manip_baselines.policy.interface import Sizes
+from robo_manip_baselines.policy.interface import PolicyDims
 
-BLIND = Sizes(state=5, action=3, cameras=0, image=(40, 70))
+BLIND = PolicyDims(state=5, action=3, cameras=0, image=(40, 70))
 
 
 def test_under_autocast_both_ends_keep_their_digits(make_model):
@@ -28,7 +28,7 @@ def test_under_autocast_losses_and_actions_are_fp32(make_model, make_batch):
     exact = model.loss(batch)
     with torch.autocast("cpu", torch.bfloat16):
         losses = model.loss(batch)
-        actions = model.predict(batch.state, batch.images)
+        actions = model.predict(batch.state, batch.images, None)
     assert {value.dtype for value in losses.values()} | {actions.dtype} == {torch.float32}
     for name, value in losses.items():
         # bf16 has 8 bits: 0.4 % a product, some of which adds up over the layers.
@@ -40,14 +40,14 @@ def test_under_autocast_losses_and_actions_are_fp32(make_model, make_batch):
 def test_the_copy_for_inference_predicts_the_same(
     make_model, make_batch, dtype: torch.dtype, tolerance: float, cameras: int
 ):
-    sizes = Sizes(5, 3, cameras, (40, 70))
-    model, batch = make_model(sizes, dropout=0.1).train(), make_batch(sizes)
+    dims = PolicyDims(5, 3, cameras, (40, 70))
+    model, batch = make_model(dims, dropout=0.1).train(), make_batch(dims)
     state = {name: value.clone() for name, value in model.state_dict().items()}
     copied = model.for_inference(dtype)
     assert model.training
-    found = copied.predict(batch.state, batch.images)
+    found = copied.predict(batch.state, batch.images, None)
     assert found.dtype == torch.float32
-    expected = model.eval().predict(batch.state, batch.images)
+    expected = model.eval().predict(batch.state, batch.images, None)
     scale = expected.abs().max().item()
     torch.testing.assert_close(found, expected, rtol=0.0, atol=tolerance * scale)
     assert not any(p.requires_grad for p in copied.parameters())

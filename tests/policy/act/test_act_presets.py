@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.policy.act.config import PRESETS
-from robo_manip_baselines.training.sampling import Schedule
+from robo_manip_baselines.training.sampling import ExampleSampler
 
 
 def test_paper_is_table_3() -> None:
@@ -19,8 +19,8 @@ def test_paper_is_table_3() -> None:
     assert training.epochs == 2000
     assert training.sampler == "episode"
     assert (preset.cameras, preset.image_size, preset.object_pose) == (CAMERAS, (480, 640), False)
-    schedule = Schedule([430] * 50, training.sampler, training.batch_size, 0)
-    assert schedule.total_steps(training) == 12_500
+    sampler = ExampleSampler([430] * 50, training.sampler, training.batch_size, 0)
+    assert sampler.total_steps(training) == 12_500
 
 
 def test_cpu_sees_no_images() -> None:

@@ -26,10 +26,14 @@ def numbers(tree: dict[str, Any], prefix: str = "") -> dict[str, float]:
     return flat
 
 
-@pytest.mark.parametrize("preset", ["default", "paper_compat"])
-def test_a_training_step(repository: Path, preset: str):
+@pytest.mark.parametrize("step", ["default", "paper_compat", "mlp"])
+def test_a_training_step(repository: Path, step: str) -> None:
     golden = runpy.run_path(str(repository / "tests" / "golden" / "regenerate.py"))
-    expected = numbers(json.loads(golden["ACT_STEP"].read_text())[preset])
-    found = numbers(golden["act_step"](paper_compat=preset == "paper_compat"))
+    if step == "mlp":
+        expected, found = json.loads(golden["MLP_STEP"].read_text()), golden["mlp_step"]()
+    else:
+        expected = json.loads(golden["ACT_STEP"].read_text())[step]
+        found = golden["act_step"](paper_compat=step == "paper_compat")
+    expected, found = numbers(expected), numbers(found)
     assert found.keys() == expected.keys()
     assert found == pytest.approx(expected, rel=TOLERANCE)

@@ -1,0 +1,224 @@
+"""Configuration of a training run: one frozen dataclass, without PyTorch.
+
+In JSON and in ``config.yaml`` all settings stand side by side under the names of their options,
+as in every release.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import tyro
+import yaml
+
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import Corruption, ObservationSpec
+from robo_manip_baselines.observation.spec import parse_image_size
+from robo_manip_baselines.policy.presets import ActionExecution, TrainSettings, require_at_least
+from robo_manip_baselines.policy.registry import policy_presets
+from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import write_text
+
+Network = TypeVar("Network")
+
+CONFIG = "config.yaml"
+METRICS = "metrics.jsonl"
+CURVES = "curves.png"
+
+RUNTIME_OPTIONS = frozenset(
+    {"device", "logger", "dataset", "out", "log_every", "validate_every", "checkpoint_every"}
+)
+"""Options that may change when a run is resumed: they do not decide the weights."""
+
+_PARTS = ("network", "training", "spec")
+"""Attributes of the configuration whose fields are options."""
+
+_CORRUPTION = {
+    "corruption_seed" if item.name == "seed" else item.name: item.name
+    for item in fields(Corruption)
+    if item.name != "stats_sha256"
+}
+"""Option -> attribute of `Corruption`."""
+
+
+@dataclass(frozen=True)
+class TrainConfig(Generic[Network]):
+    """Everything that decides a training run.
+
+    Attributes:
+        policy: Policy, for example Act.
+        network: Settings of the network.
+        training: Optimiser, sampling and budget.
+        spec: Observations of the policy.
+        env: Environment of the demonstrations.
+        dataset: Folder of demonstrations; dataset/<env> if not given.
+        num_episodes: Use only so many demonstrations, the first ones; all if not given.
+        preset: Origin of the defaults: paper, cpu, ..., or auto: paper where there is a GPU, else
+            cpu.
+        seed: Seed of the weights, of the order of the examples and of the split.
+        device: auto, cpu, cuda or cuda:NUMBER.
+        out: Run folder; runs/<policy>_<obs>[_h<horizon>][_<corruption>]_<preset>_seed<seed> if
+            not given.
+        logger: Display of the curves beside metrics.jsonl: tensorboard, wandb or none.
+        log_every: Steps between lines of metrics.jsonl.
+        validate_every: Steps between losses on the episodes held out.
+        checkpoint_every: Steps between checkpoints.
+
+    Raises:
+        RequestError: a value that is not valid.
+    """
+
+    policy: tyro.conf.Positional[str]
+    network: tyro.conf.OmitArgPrefixes[Network]
+    training: tyro.conf.OmitArgPrefixes[TrainSettings]
+    spec: tyro.conf.OmitArgPrefixes[ObservationSpec]
+    env: str = "FeedingEnv"
+    dataset: Path | None = None
+    num_episodes: int | None = None
+    preset: str = "cpu"
+    seed: int = 0
+    device: str = "auto"
+    out: Path | None = None
+    logger: str = "tensorboard"
+    log_every: int = 50
+    validate_every: int = 500
+    checkpoint_every: int = 1000
+
+    def __post_init__(self) -> None:
+        require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
+        task_entry(self.env)
+        require_at_least(1, self, "log_every", "validate_every", "checkpoint_every")
+        require_at_least(0, self, "seed")
+
+    @classmethod
+    def from_preset(cls, policy: str, preset: str, **changes: Any) -> TrainConfig[Any]:
+        """Return the defaults of a preset, with changes to attributes of the configuration.
+
+        Raises:
+            RequestError: there is no such policy or preset, or a value is not valid.
+        """
+        presets = policy_presets(policy)
+        chosen = presets[require_choice("preset", preset, presets)]
+        spec = ObservationSpec(
+            obs="current_pred",
+            cameras=chosen.cameras,
+            image_size=chosen.image_size,
+            object_pose=chosen.object_pose,
+        )
+        config = cls(policy, chosen.config, chosen.training, spec, preset=preset)
+        return dataclasses.replace(config, **changes)
+
+    @property
+    def folder(self) -> Path:
+        """Run folder."""
+        if self.out is not None:
+            return self.out
+        name = f"{self.policy.lower()}_{self.spec.name}_{self.preset}_seed{self.seed}"
+        return Path("runs") / name
+
+    @property
+    def demonstrations(self) -> Path:
+        """Folder of demonstrations."""
+        return self.dataset or Path("dataset") / self.env
+
+    @property
+    def execution(self) -> ActionExecution:
+        """Default execution of the trained policy's action chunks."""
+        return policy_presets(self.policy)[self.preset].execution
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all settings by the names of their options, made of plain values."""
+        values = {name: value for name, value in vars(self).items() if name not in _PARTS}
+        for part in _PARTS:
+            values |= vars(getattr(self, part))
+        corruption = values.pop("corruption")
+        values |= {name: getattr(corruption, of) for name, of in _CORRUPTION.items()}
+        values["image_size"] = "{}x{}".format(*self.spec.image_size)
+        return {name: _plain(value) for name, value in values.items()}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> TrainConfig[Any]:
+        """Undo `to_json`; settings that are missing have the defaults of the preset.
+
+        Raises:
+            RequestError: a name or a value that is not valid.
+        """
+        default = cls.from_preset(values.get("policy", ""), values.get("preset", "cpu"))
+        known = [*default.to_json(), "corruption"]
+        for name in values:
+            require_choice("option", name, known)
+        given: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in values.items()
+        }
+        for name in ("dataset", "out"):
+            given[name] = Path(given[name]) if given.get(name) else None
+        if "image_size" in given:
+            given["image_size"] = parse_image_size(given["image_size"])
+        corruption = {of: given[name] for name, of in _CORRUPTION.items() if name in given}
+        is_on = given.pop("corruption", True) is not False  # --no_corruption of older releases
+        chosen = {of: value for of, value in corruption.items() if value is not None and is_on}
+        given["corruption"] = Corruption(**chosen)
+
+        def changed(part: Any) -> Any:
+            names = {item.name for item in fields(part)} & given.keys()
+            return dataclasses.replace(part, **{name: given[name] for name in names})
+
+        given |= {part: changed(getattr(default, part)) for part in _PARTS}
+        return changed(default)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read a YAML file of options.
+
+    Raises:
+        RequestError: it cannot be read, or is no mapping.
+    """
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RequestError(f"cannot read '{path}': {error.strerror or error}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise RequestError(f"'{path}' is no YAML: {error}") from error
+    values = {} if values is None else values
+    if not isinstance(values, dict):
+        raise RequestError(f"'{path}' must be lines of 'option: value'")
+    return {str(name): value for name, value in values.items()}
+
+
+def write_config(run: Path, config: TrainConfig[Any]) -> None:
+    """Write the options of a run, except its folder, so that ``--config`` reads them."""
+    values = {name: value for name, value in config.to_json().items() if name != "out"}
+    write_text(run / CONFIG, yaml.safe_dump(values, sort_keys=False, allow_unicode=True))
+
+
+def require_same_config(run: Path, config: TrainConfig[Any]) -> None:
+    """Make sure that a run folder's options are those of ``config``, runtime options apart.
+
+    Raises:
+        RequestError: naming the first option that differs.
+    """
+    written = read_config(run / CONFIG)
+    try:
+        before = TrainConfig.from_json(written).to_json()
+    except RequestError as error:
+        raise RequestError(f"'{run / CONFIG}': {error}; choose another --out") from error
+    for name, value in config.to_json().items():
+        if name not in RUNTIME_OPTIONS and value != before.get(name):
+            old, new = (
+                " ".join(map(str, v)) if isinstance(v, list) else v for v in (before[name], value)
+            )
+            raise RequestError(
+                f"'{run}' holds a run with {name} {old}, not {new}; "
+                "choose another --out, or give the same options"
+            )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    return list(value) if isinstance(value, tuple) else value

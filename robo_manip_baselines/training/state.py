@@ -1,0 +1,153 @@
+"""State of a trainer: saved and restored exactly, so that resuming changes nothing.
+
+Beside the evaluated weights a checkpoint has tensors named ``weights/NAME`` (the trained weights,
+only where an average is evaluated), ``exp_avg/NAME`` and ``exp_avg_sq/NAME`` (AdamW), and
+``metrics`` (sums since the last line of ``metrics.jsonl``); NAME is the parameter's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from robo_manip_baselines.policy.checkpoint import MODEL, Checkpoint, read_trainer
+from robo_manip_baselines.policy.interface import PolicyModel
+from robo_manip_baselines.policy.presets import TrainSettings
+from robo_manip_baselines.training.optim import WeightAverage, make_optimizer
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class RunningMean:
+    """Means of scalars that stay on the device until they are needed.
+
+    Attributes:
+        names: of the scalars; none before the first step.
+        count: steps that are summed.
+        sums: () or (n,) float64, on the device.
+    """
+
+    def __init__(self) -> None:
+        self.names: tuple[str, ...] = ()
+        self.count = 0
+        self.sums: Tensor | None = None
+
+    def add(self, metrics: Mapping[str, Tensor]) -> None:
+        """Include the scalars of a step."""
+        values = torch.stack([value.detach().double() for value in metrics.values()])
+        if self.sums is None:
+            self.names, self.sums = tuple(metrics), values
+        else:
+            self.sums += values
+        self.count += 1
+
+    def means(self) -> Tensor:
+        """Return the means, (n,) float64, still on the device; nothing is reset."""
+        assert self.sums is not None, "no step yet"
+        return self.sums / self.count
+
+    def reset(self) -> None:
+        """Forget all steps."""
+        self.sums, self.count = None, 0
+
+
+class TrainerState:
+    """Everything that a training step changes.
+
+    Args:
+        model: on its device already; changed by training.
+        settings: of the optimiser and the average.
+
+    Attributes:
+        model: the trained network.
+        optimizer: AdamW.
+        average: moving average of the weights, or None.
+        losses: means since they were last written.
+    """
+
+    def __init__(self, model: PolicyModel, settings: TrainSettings) -> None:
+        # Only convolutions have weights of four dimensions: in the layout of the images they read.
+        model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self.model = model
+        self.optimizer = make_optimizer(model, settings)
+        self.average = WeightAverage(model, settings.ema_decay) if settings.ema_decay else None
+        self.losses = RunningMean()
+
+    @property
+    def trained(self) -> list[nn.Parameter]:
+        """Parameters of the optimiser."""
+        return [p for group in self.optimizer.param_groups for p in group["params"]]
+
+    @property
+    def evaluated(self) -> PolicyModel:
+        """The network that is validated and saved: the average where there is one."""
+        if self.average is None:
+            return self.model
+        self.average.copy_buffers()
+        return self.average.model
+
+    def state_dict(self, step: int, seconds: float) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return what `restore` needs beside the evaluated weights, as tensors and as JSON.
+
+        Args:
+            step: optimiser steps done.
+            seconds: spent on them.
+        """
+        tensors: dict[str, Tensor] = {}
+        if self.average:
+            tensors |= {f"weights/{k}": v for k, v in self.model.state_dict().items()}
+        steps: dict[str, int] = {}  # differ only where a parameter got no gradient
+        for name, parameter in self._named():
+            if state := self.optimizer.state.get(parameter):
+                tensors |= {f"{moment}/{name}": state[moment] for moment in _MOMENTS}
+                steps[name] = int(state["step"])
+        if self.losses.sums is not None:
+            tensors["metrics"] = self.losses.sums
+        metrics = {"names": list(self.losses.names), "count": self.losses.count}
+        json = {"step": step, "seconds": seconds, "optimizer_steps": steps, "metrics": metrics}
+        return tensors, json
+
+    @torch.no_grad()
+    def restore(self, checkpoint: Checkpoint) -> float:
+        """Restore the state of a checkpoint of the same network and settings.
+
+        Returns:
+            Seconds spent until then.
+
+        Raises:
+            RequestError: the checkpoint lacks the trainer's state, or it is damaged.
+        """
+        weights = safetensors.torch.load_file(checkpoint.folder / MODEL)
+        tensors, json = read_trainer(checkpoint)
+        if self.average:
+            self.average.model.load_state_dict(weights)
+            weights = {
+                name.removeprefix("weights/"): tensor
+                for name, tensor in tensors.items()
+                if name.startswith("weights/")
+            }
+        self.model.load_state_dict(weights)
+        fused = bool(self.optimizer.defaults["fused"])
+        for name, parameter in self._named():
+            if name not in json["optimizer_steps"]:
+                continue
+            # In the memory layout of the parameter, as AdamW itself makes them.
+            moments = {
+                m: torch.empty_like(parameter).copy_(tensors[f"{m}/{name}"]) for m in _MOMENTS
+            }
+            device = parameter.device if fused else "cpu"
+            count = torch.tensor(float(json["optimizer_steps"][name]), device=device)
+            self.optimizer.state[parameter] = {"step": count, **moments}
+        self.losses.names = tuple(json["metrics"]["names"])
+        self.losses.count = json["metrics"]["count"]
+        if self.losses.count:
+            self.losses.sums = tensors["metrics"].to(next(self.model.parameters()).device)
+        return json["seconds"]
+
+    def _named(self) -> Iterator[tuple[str, nn.Parameter]]:
+        trained = set(map(id, self.trained))
+        return ((n, p) for n, p in self.model.named_parameters() if id(p) in trained)
