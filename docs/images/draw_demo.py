@@ -1,4 +1,4 @@
-"""Draws the README's picture: ``python docs/images/draw_demo.py``, after ``make demo``."""
+"""Draws the image of the README: ``python docs/images/draw_demo.py``, after ``make demo``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/robot.md: ``python docs/images/draw_robot.py``."""
+"""Draws the images of docs/robot.md: ``python docs/images/draw_robot.py``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What README.md and docs/ say is true: commands, options, paths, links, and the Python in them."""
+"""Commands, options, paths, links and Python in README.md and docs/ work."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import EXPERTS
+from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
 from robo_manip_baselines.observation import PRESETS
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
@@ -30,7 +30,7 @@ def fenced(text: str, language: str) -> list[str]:
 
 
 def commands(text: str) -> list[list[str]]:
-    """Return the words of every command in a bash block or between backticks."""
+    """Words of every command in a bash block or between backticks."""
     blocks = [block.replace("\\\n", " ") for block in fenced(text, "bash")]
     lines = [line for block in blocks for line in block.splitlines()]
     prose = FENCE.sub("", text)
@@ -46,7 +46,7 @@ def run(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_readme_names_the_commands_of_the_data_flow(readme: str) -> None:
-    said = {" ".join(words[:3]) for words in commands(readme)}
+    named = {" ".join(words[:3]) for words in commands(readme)}
     for start in (
         "make demo",
         "make test",
@@ -55,7 +55,7 @@ def test_readme_names_the_commands_of_the_data_flow(readme: str) -> None:
         "python bin/Rollout.py FeedingEnv",
         "python bin/Dataset.py verify",
     ):
-        assert start in said
+        assert start in named
 
 
 def test_make_targets_exist(readme: str, repository: Path) -> None:
@@ -88,14 +88,14 @@ def test_every_option_of_a_command_is_in_its_help(readme: str, repository: Path)
 
 
 def first_column(text: str, heading: str) -> set[str]:
-    """Return the names in backticks that the rows of a table below ``heading`` begin with."""
+    """Names in backticks at the start of the rows of a table below ``heading``."""
     section = text.partition(f"## {heading}\n")[2].partition("\n## ")[0]
     return set(re.findall(r"^\| `(\w+)`", section, flags=re.MULTILINE))
 
 
 def test_tables_list_what_there_is(readme: str) -> None:
-    assert first_column(readme, "What a policy is shown") == set(PRESETS)
-    assert first_column(readme, "Experts") == set(EXPERTS)
+    assert first_column(readme, "Observations") == set(PRESETS)
+    assert first_column(readme, "Experts") == set(ENTRY.experts)
 
 
 @pytest.mark.gl
@@ -126,7 +126,7 @@ def test_links_lead_somewhere(repository: Path, project_files: list[Path]) -> No
 
 
 def test_paths_in_backticks_exist(repository: Path, project_files: list[Path]) -> None:
-    """Whatever a page writes as a path below a folder of the repository is there."""
+    """Every path below a folder of the repository that a page names exists."""
     ours = re.compile(r"^(?:robo_manip_baselines|face_prediction|tests|docs|bin|benchmarks|\.ci)/")
     missing = [
         f"{page}: {code}"
@@ -147,11 +147,11 @@ def test_every_page_is_in_the_index(repository: Path, project_files: list[Path])
         assert pages - {(folder / "README.md").as_posix()} <= linked
 
 
-def test_pictures_are_shown_somewhere(repository: Path, project_files: list[Path]) -> None:
-    shown = {
+def test_images_are_used(repository: Path, project_files: list[Path]) -> None:
+    used = {
         os.path.normpath(page.parent / target)
         for page in documents(project_files)
         for target in LINK.findall((repository / page).read_text(encoding="utf-8"))
     }
-    pictures = {str(f) for f in project_files if f.parts[0] == "docs" and f.suffix == ".png"}
-    assert pictures <= shown
+    images = {str(f) for f in project_files if f.parts[0] == "docs" and f.suffix == ".png"}
+    assert images <= used
