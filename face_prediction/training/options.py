@@ -29,7 +29,7 @@ class FaceTrainOptions:
     Example: face-prediction train cross_attention --dataset face_dataset --preset cpu
 
     Attributes:
-        model: Network; see docs/face_models.md.
+        model: Network; see docs/predictors.md.
         dataset: Folder made by build-dataset.
         test_fold: Fold whose people are left for the report. None: nobody is, for weights that are
             shipped.

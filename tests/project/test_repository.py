@@ -11,7 +11,7 @@ MAX_FILE_BYTES = 2_000_000  # data beyond that belongs in a release, not in ever
 MAX_SCRIPT_LINES = 40
 # Footage and photographs of people, and other people's model files, are not ours to publish.
 FOOTAGE = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif", ".jpg", ".jpeg", ".heic", ".webp"}
-OURS = {"face_prediction/assets/residual/model.safetensors"}  # docs/face_residual.md says of whom
+OURS = {"face_prediction/assets/residual/model.safetensors"}  # docs/predictors.md says of whom
 MODELS = {".task", ".tflite", ".pt", ".pth", ".onnx", ".safetensors"}
 
 

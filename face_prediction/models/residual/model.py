@@ -57,7 +57,9 @@ BACKGROUND = 0.3
 ORIGIN_STEP = 3
 """Frames between the origins of a sequence that are trained on. The last is at its end; the first
 has as many frames before it as the network sees."""
-_USUAL_ERROR = 0.01  # crops, counts 1 in the loss: the best baselines' (docs/forecasting.md)
+_USUAL_ERROR = (
+    0.01  # crops, counts 1 in the loss: the best baselines' (docs/predictor_evaluation.md)
+)
 
 
 def cut_out(images: Tensor, landmarks: Tensor, side: int) -> Tensor:
@@ -286,7 +288,7 @@ def _begin_at_zero(*layers: nn.Module) -> None:
 
 
 class ResidualModel(PredictorModel):
-    """Prior, correction, warp and refinement; see docs/face_residual.md."""
+    """Prior, correction, warp and refinement; see docs/predictors.md."""
 
     def __init__(self, settings: ResidualSettings) -> None:
         super().__init__()

@@ -104,7 +104,7 @@ EXPERTS = (
     Expert(3, 3.0),
     Expert(3, 1.0, periodic=True),
 )
-"""Chosen on folds of the development clips among 54; see docs/face_residual.md. The expert that
+"""Chosen on folds of the development clips among 54; see docs/predictors.md. The expert that
 expects no motion at all needs no line here."""
 
 
