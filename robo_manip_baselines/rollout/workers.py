@@ -87,7 +87,9 @@ class EnvConfig:
         Raises:
             RequestError: an argument is not valid.
         """
-        return make_env(self.env, **{**self.spec.env_kwargs(), **self.env_kwargs, **changes})
+        kwargs = {**self.spec.env_kwargs(), **self.env_kwargs, **changes}
+        # Gymnasium's checker would miss the images of steps in which no policy needs them.
+        return make_env(self.env, disable_env_checker=True, **kwargs)
 
 
 class StepRequest(NamedTuple):
