@@ -17,7 +17,7 @@ from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
-from robo_manip_baselines.policy.presets import Acting, Sizes, TrainSettings
+from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims, TrainSettings
 from robo_manip_baselines.rollout.workers import EnvConfig
 
 SPEC = ObservationSpec(obs="current_pred", cameras=(), object_pose=True)
@@ -42,7 +42,7 @@ def make_checkpoint(env_config: EnvConfig) -> MakeCheckpoint:
 
     def make(folder: Path, **changes: object) -> Checkpoint:
         config = MlpConfig(chunk_size=6, hidden_size=16, hidden_layers=1)
-        sizes = Sizes(env_config.vector_size, env_config.action_size, 0, SPEC.image_size)
+        sizes = PolicyDims(env_config.vector_size, env_config.action_size, 0, SPEC.image_size)
         model = MlpModel(config, sizes)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
@@ -54,7 +54,7 @@ def make_checkpoint(env_config: EnvConfig) -> MakeCheckpoint:
             "sizes": sizes,
             "spec": SPEC,
             "env": "FeedingEnv",
-            "acting": Acting(),
+            "acting": ActionExecution(),
             "normalization": Normalization(
                 np.zeros(sizes.state, np.float32),
                 np.ones(sizes.state, np.float32),

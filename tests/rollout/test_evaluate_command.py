@@ -19,7 +19,7 @@ from robo_manip_baselines.commands.rollout import main, parse_options, to_evalua
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import Checkpoint
-from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.rollout.evaluation import (
     EvaluationConfig,
     EvaluationPlan,
@@ -239,9 +239,9 @@ def test_seeds_of_demonstrations_are_pointed_out(
 
 
 def test_the_execution_is_the_trained_one_unless_changed() -> None:
-    trained = Acting(temporal_ensemble=False, decay=0.1, execute=4)
+    trained = ActionExecution(temporal_ensemble=False, ensemble_decay=0.1, n_action_steps=4)
     assert choose_execution(trained, False, None) == trained
-    assert choose_execution(trained, False, 2) == replace(trained, execute=2)
+    assert choose_execution(trained, False, 2) == replace(trained, n_action_steps=2)
     ensemble = choose_execution(trained, True, None)
     assert (ensemble.temporal_ensemble, ensemble.decay) == (True, 0.1)
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model
-from robo_manip_baselines.policy.execution import ChunkPolicy
+from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.policy.interface import PolicyModel
-from robo_manip_baselines.policy.presets import Acting
+from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.rollout.demonstrate import demonstrate
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import ActingPolicy, Recording, rollout
@@ -36,7 +36,7 @@ from robo_manip_baselines.runs.errors import RequestError
 pytestmark = pytest.mark.long
 
 SEEDS = [1004, 1000, 1007, 1001, 1003]
-FIRST = Acting(temporal_ensemble=False, execute=4)
+FIRST = ActionExecution(temporal_ensemble=False, n_action_steps=4)
 
 
 @pytest.fixture(scope="module")
@@ -81,14 +81,14 @@ def play(policy: ActingPolicy, envs: EnvPool, seeds: list[int]) -> Played:
     return results, recordings
 
 
-def network(checkpoint: Checkpoint, acting: Acting, num_envs: int) -> ChunkPolicy:
+def network(checkpoint: Checkpoint, acting: ActionExecution, num_envs: int) -> PolicyRunner:
     model, spec = load_model(checkpoint), checkpoint.spec
-    return ChunkPolicy(model, spec, checkpoint.normalization, acting, slots=num_envs)
+    return PolicyRunner(model, spec, checkpoint.normalization, acting, num_envs=num_envs)
 
 
 POLICIES: dict[str, Callable[[Checkpoint, int], ActingPolicy]] = {
     "recurrent": lambda _, num_envs: Recurrent(num_envs),
-    "ensemble": lambda checkpoint, num_envs: network(checkpoint, Acting(), num_envs),
+    "ensemble": lambda checkpoint, num_envs: network(checkpoint, ActionExecution(), num_envs),
     "first": lambda checkpoint, num_envs: network(checkpoint, FIRST, num_envs),
 }
 
@@ -276,9 +276,9 @@ def test_a_network_that_sees_acts_the_same_in_any_arrangement(env_config: EnvCon
     ones, zeros = np.ones(seen.vector_size, np.float32), np.zeros(seen.vector_size, np.float32)
     scale = Normalization(zeros, ones, zeros[:7], ones[:7])
     played = []
-    for acting in (Acting(), FIRST):
+    for acting in (ActionExecution(), FIRST):
         for num_envs, workers in ((1, 0), (3, 2)):
-            policy = ChunkPolicy(Seeing(), spec, scale, acting, slots=num_envs)
+            policy = PolicyRunner(Seeing(), spec, scale, acting, num_envs=num_envs)
             with open_envs(seen, num_envs, workers) as envs:
                 _, recordings = play(policy, envs, SEEDS)
             played.append(np.array([recordings[seed].actions for seed in SEEDS]))
