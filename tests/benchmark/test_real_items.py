@@ -60,7 +60,7 @@ DRIVER = """
 import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from test_real_units import do
+from test_real_items import do
 do(Path({out!r}), 2)
 """
 
