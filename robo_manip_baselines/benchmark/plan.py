@@ -203,7 +203,7 @@ class Plan:
             config = Collection(self.env, Path(OUT), condition.expert, seeds, env_kwargs)
             name = f"{variant}_{seeds.start:06d}"
             settings = {"config": config.to_json(), "prediction": prediction}
-            item = self._item("demonstrations", name, "demonstrate", settings, self._files())
+            item = self._item("demonstrations", name, "run_demonstrations", settings, self._files())
             items.append(replace(item, threads=1, gpus=0.0, seconds=item.seconds * len(seeds)))
         return tuple(items)
 
@@ -231,7 +231,7 @@ class Plan:
             files[STATS] = self.error_stats
         config = replace(config, spec=spec)
         name = f"{condition.name}_seed{train_seed}"
-        training = self._item("training", name, "train", {"config": config.to_json()}, files)
+        training = self._item("training", name, "run_training", {"config": config.to_json()}, files)
         training = replace(training, needs=demonstrations)
         evaluations = tuple(
             self._evaluation("evaluation", f"{name}_{seeds.start:06d}", seeds, condition, training)
@@ -252,7 +252,7 @@ class Plan:
             videos=int(kind == "video"),
         )
         settings = {"config": config.to_json(), "prediction": condition.prediction}
-        item = self._item(kind, name, "evaluate", settings, training.files)
+        item = self._item(kind, name, "run_evaluation", settings, training.files)
         return replace(item, needs=(training,), seconds=item.seconds * len(seeds))
 
     def _item(

@@ -100,7 +100,7 @@ def last_line(log: str) -> str:
     return lines[-1].removeprefix("error: ") if lines else ""
 
 
-def demonstrate(settings: Mapping[str, Any]) -> None:
+def run_demonstrations(settings: Mapping[str, Any]) -> None:
     """Record demonstrations; keep the successful ones."""
     from robo_manip_baselines.rollout.demonstrate import Collection, collect
 
@@ -111,7 +111,7 @@ def demonstrate(settings: Mapping[str, Any]) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def train(settings: Mapping[str, Any]) -> int:
+def run_training(settings: Mapping[str, Any]) -> int:
     """Train a policy, or continue; of the checkpoints keep the last, without the optimiser."""
     from robo_manip_baselines.training.requirements import prepare_pytorch
 
@@ -119,9 +119,9 @@ def train(settings: Mapping[str, Any]) -> int:
     from robo_manip_baselines.policy.checkpoint import TRAINER, TRAINER_TENSORS
     from robo_manip_baselines.runs.checkpoints import list_checkpoints
     from robo_manip_baselines.training.config import TrainConfig
-    from robo_manip_baselines.training.trainer import train as train_policy
+    from robo_manip_baselines.training.trainer import train
 
-    code = train_policy(TrainConfig.from_json(settings["config"]), resume=True)
+    code = train(TrainConfig.from_json(settings["config"]), resume=True)
     if not code:
         *earlier, (_, last) = list_checkpoints(Path(OUT))
         for _, folder in earlier:
@@ -131,16 +131,12 @@ def train(settings: Mapping[str, Any]) -> int:
     return code
 
 
-def evaluate(settings: Mapping[str, Any]) -> None:
+def run_evaluation(settings: Mapping[str, Any]) -> None:
     """Evaluate a policy."""
-    from robo_manip_baselines.training.requirements import prepare_pytorch
-
-    prepare_pytorch()
-    from robo_manip_baselines.rollout.evaluation import EvaluationConfig
-    from robo_manip_baselines.rollout.evaluation import evaluate as evaluate_policy
+    from robo_manip_baselines.rollout.evaluation import EvaluationConfig, evaluate
 
     _write_forecast(settings)
-    evaluate_policy(EvaluationConfig.from_json(settings["config"]))
+    evaluate(EvaluationConfig.from_json(settings["config"]))
 
 
 def _write_forecast(settings: Mapping[str, Any]) -> None:

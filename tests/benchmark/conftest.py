@@ -32,7 +32,7 @@ def digest(*parts):
     return hashlib.sha256("|".join(map(str, parts)).encode()).hexdigest()
 
 
-def demonstrate(settings):
+def run_demonstrations(settings):
     OUT.mkdir(exist_ok=True)
     config = settings["config"]
     for seed in range(*config["seeds"]):
@@ -40,7 +40,7 @@ def demonstrate(settings):
         (OUT / f"episode_{seed:06d}.hdf5").write_text(text)
 
 
-def train(settings):
+def run_training(settings):
     """Ten steps, each saved: who goes on must not begin again."""
     shown = [path.read_text() for path in sorted(Path("demonstrations").glob("*.hdf5"))]
     state, step = digest(*shown, json.dumps(settings["config"])), 0
@@ -59,7 +59,7 @@ def train(settings):
         raise RuntimeError("the stub fails")
 
 
-def evaluate(settings):
+def run_evaluation(settings):
     """A line for each seed; those that are there already are not done again."""
     from robo_manip_baselines.rollout.results import EpisodeResult
 
