@@ -375,10 +375,7 @@ def write_episode(
     if problems:
         raise ValueError(f"episode for '{path}': {'; '.join(problems)}")
     stored["content_sha256"] = stored_text(content_digest(schema, fields, checksums, loaded))
-    with (
-        atomic_file(path) as temporary,
-        h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file,
-    ):
+    with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
         for item in schema.attributes:
             file.attrs[item.name] = stored[item.name]
         for field in schema.fields:

@@ -18,11 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.tasks.registry import (
-    Attribute,
-    Field,
-    TaskEntry,
-)
+from robo_manip_baselines.envs.mujoco.tasks.registry import Attribute, Field, TaskEntry
 
 SCHEMA = "robo_manip_baselines/episode"
 SCHEMA_VERSION = 3
@@ -72,12 +68,7 @@ _STATE_FIELDS = (
     Field("gripper_position", ("T", "G"), "float64", "m", "joint", "Finger slide position"),
     Field("gripper_velocity", ("T", "G"), "float64", "m/s", "joint", "Finger slide velocity"),
     Field(
-        "end_effector_position",
-        ("T", 3),
-        "float64",
-        "m",
-        "world",
-        "Right gripper site: x, y, z",
+        "end_effector_position", ("T", 3), "float64", "m", "world", "Right gripper site: x, y, z"
     ),
     Field(
         "end_effector_orientation",
@@ -119,12 +110,7 @@ _OUTCOME_FIELDS = (
     ),
     Field("qpos", ("T", "Q"), "float64", "m, rad, 1", "joint", "Simulator positions, all of them"),
     Field(
-        "qvel",
-        ("T", "V"),
-        "float64",
-        "m/s, rad/s",
-        "joint",
-        "Simulator velocities, all of them",
+        "qvel", ("T", "V"), "float64", "m/s, rad/s", "joint", "Simulator velocities, all of them"
     ),
 )
 """Fields of every episode, after those of the task."""

@@ -18,12 +18,7 @@ from robo_manip_baselines.data import (
     read_metadata,
     write_episode,
 )
-from robo_manip_baselines.data.example import (
-    make_arrays,
-    make_attributes,
-    make_frames,
-    make_images,
-)
+from robo_manip_baselines.data.example import make_arrays, make_attributes, make_frames, make_images
 from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.data.verify import verify_file
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry

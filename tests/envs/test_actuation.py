@@ -8,10 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.cell.scene import (
-    ARM_BASES,
-    CUBE_SIZE,
-)
+from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, CUBE_SIZE
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 

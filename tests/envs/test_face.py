@@ -16,12 +16,7 @@ from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
-from robo_manip_baselines.envs.mujoco.face import (
-    BODIES,
-    MAX_OPENING,
-    REST_OPENING,
-    FaceModel,
-)
+from robo_manip_baselines.envs.mujoco.face import BODIES, MAX_OPENING, REST_OPENING, FaceModel
 from robo_manip_baselines.envs.mujoco.face.mesh import face_oval
 from robo_manip_baselines.envs.mujoco.face.model import SURFACE
 from robo_manip_baselines.runs.errors import RequestError

@@ -8,11 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
-from robo_manip_baselines.envs.mujoco.face import (
-    BODIES,
-    REST_OPENING,
-    FaceModel,
-)
+from robo_manip_baselines.envs.mujoco.face import BODIES, REST_OPENING, FaceModel
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 
 MOUTH = np.array(MOUTH_BASE)

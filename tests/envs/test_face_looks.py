@@ -13,11 +13,7 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
-from robo_manip_baselines.envs.mujoco.face import (
-    REST_OPENING,
-    FaceModel,
-    add_face,
-)
+from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
 from robo_manip_baselines.envs.mujoco.face.mesh import encode_png, head, paint
 
 MOUTH = np.array(MOUTH_BASE)

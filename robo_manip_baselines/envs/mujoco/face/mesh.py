@@ -87,11 +87,7 @@ def _skull_rings(start: Floats, steps: Floats, swell: Floats) -> Floats:
     first = np.arccos(np.clip((start[:, 0] - SKULL_CENTRE[0]) / SKULL_RADII[0], -1.0, 1.0))
     latitude = first + (np.pi - first) * steps[:, None]
     direction = np.stack(
-        [
-            np.cos(latitude),
-            np.sin(latitude) * np.sin(around),
-            np.sin(latitude) * np.cos(around),
-        ],
+        [np.cos(latitude), np.sin(latitude) * np.sin(around), np.sin(latitude) * np.cos(around)],
         axis=-1,
     )
     on_skull = SKULL_CENTRE + SKULL_RADII * direction

@@ -23,9 +23,7 @@ from robo_manip_baselines.runs.errors import RequestError, require_choice
 NAMESPACE = "robo_manip_baselines"
 ENTRY_POINTS = "robo_manip_baselines.tasks"
 
-TASKS = {
-    "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
-}
+TASKS = {"FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY"}
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
 
 Size = int | str
