@@ -14,12 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robo_manip_baselines.observation.error_stats import ErrorStats
+from robo_manip_baselines.observation.state import Floats
 from robo_manip_baselines.runs.errors import RequestError
 
-Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, int], Floats]
 """(generator, F) -> (F, H, 2) m."""
 

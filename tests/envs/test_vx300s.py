@@ -160,12 +160,9 @@ def test_joint_limits_are_the_published_ones(model: mujoco.MjModel) -> None:
     assert tuple(joint for joint, *_ in CHAIN) == ARM_JOINTS
     for arm in ARM_BASES:
         for joint, _, _, limits in CHAIN:
-            assert vx300s.JOINT_LIMITS[joint] == pytest.approx(limits, abs=1e-12)
-            for kind in (
-                model.joint(f"{arm}/{joint}").range,
-                model.actuator(f"{arm}/{joint}").ctrlrange,
-            ):
-                assert tuple(kind) == pytest.approx(limits, abs=1e-10)
+            joint_range = model.joint(f"{arm}/{joint}").range
+            for found in (joint_range, model.actuator(f"{arm}/{joint}").ctrlrange):
+                assert tuple(found) == pytest.approx(limits, abs=1e-10)
         fingers = (vx300s.FINGER_CLOSED, vx300s.FINGER_OPEN)
         assert fingers == (0.021, 0.057)
         assert tuple(model.joint(f"{arm}/left_finger").range) == fingers
@@ -174,8 +171,7 @@ def test_joint_limits_are_the_published_ones(model: mujoco.MjModel) -> None:
 
 
 def test_home_pose_is_within_the_limits() -> None:
-    for angle, joint in zip(vx300s.HOME_QPOS, ARM_JOINTS, strict=True):
-        low, high = vx300s.JOINT_LIMITS[joint]
+    for angle, (*_, (low, high)) in zip(vx300s.HOME_QPOS, CHAIN, strict=True):
         assert low < angle < high
 
 

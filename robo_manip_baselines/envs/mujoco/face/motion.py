@@ -96,11 +96,8 @@ class MotionSegment:
         slerp = Slerp(knots, Rotation.from_quat(self.orientation, scalar_first=True))
         orientation = slerp(flat).as_quat(scalar_first=True, canonical=True)
         jaw = np.interp(flat, knots, self.jaw)
-        return (
-            displacement.reshape(*frame.shape, 3),
-            orientation.reshape(*frame.shape, 4),
-            jaw.reshape(frame.shape),
-        )
+        shape = frame.shape
+        return displacement.reshape(*shape, 3), orientation.reshape(*shape, 4), jaw.reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -151,9 +148,8 @@ class MotionLibrary:
                 content = {key: archive[key] for key in archive.files}
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise RequestError(
-                f"motion library '{source}' cannot be read ({reason}); {remedy}"
-            ) from error
+            problem = f"motion library '{source}' cannot be read ({reason})"
+            raise RequestError(f"{problem}; {remedy}") from error
         problem = find_problem(content)
         if problem:
             raise RequestError(f"motion library '{source}' is damaged: {problem}; {remedy}")
@@ -198,10 +194,9 @@ class MotionLibrary:
             counts = np.where([clip in wanted for clip in self.run_clip], counts, 0)
         total = int(counts.sum())
         if total == 0:
-            raise RequestError(
-                f"no run of '{self.source.name}' lasts {duration:g} s"
-                f"{' in clips ' + ', '.join(clips) if clips else ''}; choose other clips"
-            )
+            where = f" in clips {', '.join(clips)}" if clips else ""
+            lacking = f"no run of '{self.source.name}' lasts {duration:g} s{where}"
+            raise RequestError(f"{lacking}; choose other clips")
         index = int(rng.integers(total))
         run = int(np.searchsorted(np.cumsum(counts), index, side="right"))
         return self.segment(run, index - int(counts[:run].sum()), duration=duration)
