@@ -83,7 +83,12 @@ def _probe(backend: str) -> tuple[str, str | None]:
     command = [sys.executable, "-c", _PROBE]
     try:
         probe = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=PROBE_TIMEOUT, check=False
+            command,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PROBE_TIMEOUT,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return "", f"OpenGL ({backend}) gave no image within {PROBE_TIMEOUT:.0f} s"

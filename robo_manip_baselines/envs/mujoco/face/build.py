@@ -207,15 +207,15 @@ def add_collision(
     fast in the world while the mouth moves away from under it.
     """
     for owner, name, size, centre in _ELLIPSOIDS:
-        body[owner].add_geom(name=f"face/{name}", type=_ELLIPSOID, size=size, pos=centre, **_OUTSIDE)
+        body[owner].add_geom(
+            name=f"face/{name}", type=_ELLIPSOID, size=size, pos=centre, **_OUTSIDE
+        )
     _add_neck_and_bust(body)
     _add_lips(body, model)
     cavity = _add_cavity(spec, body["mouth"])
     for name, size, centre, tilt in _MOUTH_BOXES:
         quat = (np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0)
-        cavity.add_geom(
-            name=f"face/{name}", type=_BOX, size=size, pos=centre, quat=quat, **_INSIDE
-        )
+        cavity.add_geom(name=f"face/{name}", type=_BOX, size=size, pos=centre, quat=quat, **_INSIDE)
 
 
 def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
@@ -236,7 +236,10 @@ def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
         objtype=mujoco.mjtObj.mjOBJ_BODY,
         name1=mouth.name,
         name2=cavity.name,
-        solref=(0.004, 1.0),  # time constant, s: twice the physics step, the stiffest that is stable
+        solref=(
+            0.004,
+            1.0,
+        ),  # time constant, s: twice the physics step, the stiffest that is stable
     )
     # anchor, relative position and orientation, torque scale (explicit: its default has changed)
     weld.data[:11] = (0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1)
