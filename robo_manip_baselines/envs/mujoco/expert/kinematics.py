@@ -37,9 +37,7 @@ class ArmKinematics:
         )
         self._limits = [mink.ConfigurationLimit(model)]
         self._frame = f"{arm}/gripper"
-        self._qpos = np.array(
-            [int(model.joint(f"{arm}/{joint}").qposadr[0]) for joint in ARM_JOINTS]
-        )
+        self._qpos = np.array([model.joint(f"{arm}/{j}").qposadr[0] for j in ARM_JOINTS])
 
     def forward(self, joints: NDArray[np.float64]) -> mink.SE3:
         """Return the pose of the gripper.
@@ -63,10 +61,8 @@ class ArmKinematics:
         self._task.set_target(target)
         for _ in range(MAX_ITERATIONS):
             error = self._task.compute_error(self._configuration)
-            if (
-                np.linalg.norm(error[:3]) < POSITION_TOLERANCE
-                and np.linalg.norm(error[3:]) < ORIENTATION_TOLERANCE
-            ):
+            away, turned = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+            if away < POSITION_TOLERANCE and turned < ORIENTATION_TOLERANCE:
                 break
             velocity = mink.solve_ik(
                 self._configuration, [self._task], 1.0, solver="daqp", limits=self._limits

@@ -247,11 +247,9 @@ def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
 
 
 def _add_neck_and_bust(body: Mapping[str, mujoco.MjsBody]) -> None:
-    for owner, name, radius, ends in (
-        ("head", "neck", 0.052, (-0.055, 0, -0.03, -0.060, 0, -0.12)),
-        ("torso", "shoulders", 0.085, (-0.134, -0.125, -0.240, -0.134, 0.125, -0.240)),
-    ):
-        _add_capsule(body[owner], name, radius, ends)
+    _add_capsule(body["head"], "neck", 0.052, (-0.055, 0, -0.03, -0.060, 0, -0.12))
+    shoulders = (-0.134, -0.125, -0.240, -0.134, 0.125, -0.240)
+    _add_capsule(body["torso"], "shoulders", 0.085, shoulders)
     size, centre = (0.095, 0.195, 0.11), (-0.136, 0, -0.34)
     body["torso"].add_geom(name="face/chest", type=_BOX, size=size, pos=centre, **_OUTSIDE)
 

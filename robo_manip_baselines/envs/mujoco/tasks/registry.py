@@ -315,9 +315,8 @@ def register_envs(names: Sequence[str] | None = None) -> None:
     for name in task_names() if names is None else names:
         entry = task_entry(name)
         if entry.env_id not in gymnasium.registry:
-            gymnasium.register(
-                entry.env_id, entry_point=entry.env, max_episode_steps=entry.max_episode_steps
-            )
+            limit = entry.max_episode_steps
+            gymnasium.register(entry.env_id, entry_point=entry.env, max_episode_steps=limit)
 
 
 def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
@@ -326,9 +325,8 @@ def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     Raises:
         RequestError: there is no such task, or an argument is not valid.
     """
-    entry = task_entry(name)
     register_envs([name])
-    return gymnasium.make(entry.env_id, **kwargs)
+    return gymnasium.make(task_entry(name).env_id, **kwargs)
 
 
 FACE_FIELDS = (

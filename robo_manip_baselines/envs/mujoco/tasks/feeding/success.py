@@ -157,9 +157,15 @@ class FeedingProgress:
         if release_time is None and lifted and not step.is_touched:
             release_time, released_inside = step.time, step.is_inside_mouth
         released = release_time is not None
+        if released:
+            phase = Phase.RELEASE
+        elif lifted:
+            phase = Phase.CARRY if success_time is None else Phase.DELIVER
+        else:
+            phase = Phase.GRASP if step.is_held else Phase.REACH
         return replace(
             self,
-            phase=_phase(step, lifted, success_time is not None, released),
+            phase=phase,
             lift_time=lift_time,
             success_time=success_time,
             release_time=release_time,
@@ -167,13 +173,3 @@ class FeedingProgress:
             released_inside=released_inside,
             is_clear=self.is_clear or (released and step.gripper_distance >= CLEAR_DISTANCE),
         )
-
-
-def _phase(step: StepMeasurements, lifted: bool, succeeded: bool, released: bool) -> Phase:
-    if released:
-        return Phase.RELEASE
-    if succeeded:
-        return Phase.DELIVER
-    if lifted:
-        return Phase.CARRY
-    return Phase.GRASP if step.is_held else Phase.REACH
