@@ -17,6 +17,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import Attribute, Field, TaskEntry
 
@@ -382,7 +383,7 @@ def value_problems(field: Field, values: np.ndarray, num_phases: int | None) -> 
     """
     name, rule = field.name, field.rule
 
-    def first(bad: np.ndarray, what: str) -> list[str]:
+    def first(bad: ArrayLike, what: str) -> list[str]:
         return [f"'{name}' {what} at step {row}" for row in np.flatnonzero(bad)[:1]]
 
     finite = np.isfinite(values)

@@ -26,12 +26,8 @@ def folder(tmp_path: Path) -> Path:
             "motion_subject": f"person {seed % 2}",
             "motion_clip": f"clip {seed % 3}",
         }
-        write_episode(
-            episode_path(tmp_path, seed, seed != 2),
-            make_arrays(10 + seed, seed),
-            make_images(10 + seed),
-            attributes,
-        )
+        path, steps = episode_path(tmp_path, seed, seed != 2), 10 + seed
+        write_episode(path, make_arrays(steps, seed), make_images(steps), attributes)
     return tmp_path
 
 

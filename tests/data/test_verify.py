@@ -109,7 +109,7 @@ DAMAGE: list[tuple[Callable[[h5py.File], Any], str]] = [
     (_replace("qpos", lambda x: x.astype(np.float32)), "'qpos' is float32, not float64"),
     (
         _replace("images/top/offset", lambda x: x[:-1]),
-        "'images/top' cannot be read: 11 frames instead of 12",
+        "'images/top' cannot be read: 11 frames inst",
     ),
     (lambda file: file["qpos"].attrs.__setitem__("unit", "cm"), "'qpos' is in 'cm', not in 'm, "),
     (_assign("qvel", (5, 1), np.nan), "'qvel' is NaN or infinite, first at step 5"),

@@ -44,15 +44,11 @@ def test_surface_has_the_size_of_an_adult_face(surface: dict[str, np.ndarray]) -
     vertices = surface["vertices"]
     assert vertices.shape == (468, 3)
 
-    def apart(*pairs: tuple[tuple[int, ...], tuple[int, ...]]) -> list[float]:
-        return [
-            float(np.linalg.norm(vertices[list(a)].mean(0) - vertices[list(b)].mean(0)))
-            for a, b in pairs
-        ]
+    def apart(a: list[int], b: list[int]) -> float:
+        return float(np.linalg.norm(vertices[a].mean(0) - vertices[b].mean(0)))
 
-    pupils, face_width, mouth_width, nose_to_chin = apart(
-        ((33, 133), (362, 263)), ((234,), (454,)), ((61,), (291,)), ((2,), (152,))
-    )
+    pupils, face_width = apart([33, 133], [362, 263]), apart([234], [454])
+    mouth_width, nose_to_chin = apart([61], [291]), apart([2], [152])
     # Farkas 1994, adults of both sexes, mean +- about three standard deviations
     assert 0.055 < pupils < 0.072
     assert 0.125 < face_width < 0.165

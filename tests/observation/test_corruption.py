@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +71,8 @@ def test_labels_tell_conditions_apart(corruption: Corruption, label: str) -> Non
 
 def test_one_switch_turns_everything_off() -> None:
     for off in (Corruption(), Corruption(seed=3, face_dropout_length=4.0)):
-        assert ObservationSpec(obs="current_pred", corruption=off) == ObservationSpec(
-            obs="current_pred"
-        )
+        plain = ObservationSpec(obs="current_pred")
+        assert replace(plain, corruption=off) == plain
         assert ObservationSpec(obs="baseline", corruption=off).corruption == Corruption()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -200,7 +200,7 @@ def _add_room(spec: mujoco.MjSpec) -> None:
         conaffinity=SOLID,
         friction=(0.8, 0.005, 0.0001),
     )
-    untouchable = {"contype": 0, "conaffinity": 0}
+    untouchable: dict[str, Any] = {"contype": 0, "conaffinity": 0}
     leg = (_TABLE_HEIGHT - 2 * thickness) / 2
     for side, end in itertools.product((-1, 1), repeat=2):
         foot = (side * (width - 0.05), BASE_Y + end * (depth - 0.05), -2 * thickness - leg)
