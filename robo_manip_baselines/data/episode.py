@@ -74,13 +74,7 @@ def encode_image(
 
 
 def decode_image(data: np.ndarray) -> np.ndarray:
-    """Undo `encode_image`, whatever the codec.
-
-    Args:
-        data: (N,) uint8 of a JPEG or PNG file, or a raw (H, W, 3) uint8 image.
-
-    Returns:
-        (H, W, 3) uint8, RGB.
+    """Return the (H, W, 3) uint8 RGB image of which `encode_image` made ``data``, by any codec.
 
     Raises:
         ValueError: the bytes are no image.

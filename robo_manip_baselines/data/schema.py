@@ -182,11 +182,9 @@ class EpisodeSchema:
         return max([self.version, *(self.by_name[name].since for name in names)])
 
     def fields_of(self, version: int, present: Iterable[str] = ()) -> tuple[str, ...]:
-        """Return the names of the fields that a file holds, or should.
+        """Return the names of the fields that a file of a schema version holds, or should.
 
-        Args:
-            version: schema version of the file.
-            present: names in the file; optional fields of version 3 and later count if there.
+        From version 3 on, optional fields count if they are among the names ``present`` in it.
         """
         found = set(present)
         return tuple(

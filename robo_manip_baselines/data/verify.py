@@ -140,9 +140,7 @@ class Problem:
 def verify_file(path: str | Path, *, images: bool = True) -> list[Problem]:
     """Everything that is wrong with one episode file; an empty list means that it is whole.
 
-    Args:
-        path: the file.
-        images: read and decode every image, too; otherwise only their number is checked.
+    With ``images``, every image is read and decoded, too; otherwise only their number is checked.
     """
     path = Path(path)
     try:

@@ -274,10 +274,9 @@ class CorruptionPipeline:
         self._predicted = np.empty((0, 0, 3))
 
     def observe(self, state: State) -> TargetObservation:
-        """Return the observed target of one step, from this state and those given before.
+        """Return the observed target of one step, from its state and those given before.
 
-        Args:
-            state: of one step, later than the step before (or the same once more).
+        A step is later than the one before, or the same once more.
 
         Raises:
             RequestError: the error needs a predicted target, and there is none.
@@ -294,11 +293,7 @@ class CorruptionPipeline:
         return TargetObservation(observed.time[0], observed.position[0])
 
     def observe_episode(self, state: State, seed: int) -> TargetObservation:
-        """Return the observed target at every step of an episode, as `observe` would have.
-
-        Args:
-            state: of the whole episode, (T, ...).
-            seed: of the episode.
+        """Return the observed target at every step, (T, ...), as `observe` would have.
 
         Raises:
             RequestError: the error needs a predicted target, and there is none.

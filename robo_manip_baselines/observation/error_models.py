@@ -42,11 +42,8 @@ def uniform(stats: ErrorStats) -> Draw:
     how long an error lasts: here it is that of one video frame, independent of the next and of
     other horizons.
     """
-
-    def draw(rng: np.random.Generator, frames: int) -> Floats:
-        return rng.uniform(-1.0, 1.0, (frames, *stats.mean_abs.shape)) * stats.mean_abs
-
-    return draw
+    bound = stats.mean_abs
+    return lambda rng, frames: rng.uniform(-1.0, 1.0, (frames, *bound.shape)) * bound
 
 
 def gaussian(stats: ErrorStats) -> Draw:

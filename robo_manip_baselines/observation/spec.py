@@ -211,15 +211,10 @@ class ObservationSpec:
         return CorruptionPipeline(self.corruption, self.frames - 1) if self.corruption else None
 
     def pack(self, state: State, target: TargetObservation | None = None) -> NDArray[np.float32]:
-        """Pack all vectors of an observation into one.
+        """Pack all vectors of an observation into one, (..., S) float32.
 
-        Args:
-            state: of any leading shape.
-            target: of the same leading shape, from the corruption pipeline; the truth if None.
-
-        Returns:
-            (..., S) float32. The distances are those from the gripper now to the target as
-            observed.
+        The target is of the corruption pipeline, and the truth if None. Distances are those from
+        the gripper now to the target as observed.
 
         Raises:
             ValueError: a target is given without a corruption, or the other way round.

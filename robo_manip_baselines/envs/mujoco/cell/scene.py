@@ -93,17 +93,17 @@ def attach_arm(spec: mujoco.MjSpec, arm: str) -> None:
     spec.attach(arm_spec(), prefix=f"{arm}/", frame=frame)
 
 
-def add_cube(spec: mujoco.MjSpec, name: str = "cube") -> mujoco.MjsBody:
-    """Add the red cube, lying free on the table at (0.1, 0.5): body, free joint and geom ``name``.
+def add_cube(spec: mujoco.MjSpec) -> mujoco.MjsBody:
+    """Add the red cube, lying free on the table at (0.1, 0.5): body, free joint and geom ``cube``.
 
     Its contact bits let it touch robots, the table and the inside of a mouth, not the outside of
     a face.
     """
     half = CUBE_SIZE / 2
-    body = spec.worldbody.add_body(name=name, pos=(0.1, BASE_Y, half))
-    body.add_freejoint(name=name)
+    body = spec.worldbody.add_body(name="cube", pos=(0.1, BASE_Y, half))
+    body.add_freejoint(name="cube")
     body.add_geom(
-        name=name,
+        name="cube",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=(half, half, half),
         mass=CUBE_MASS,

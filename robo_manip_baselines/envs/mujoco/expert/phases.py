@@ -25,14 +25,11 @@ DOWN = mink.SO3.from_z_radians(np.pi) @ mink.SO3.from_y_radians(np.pi / 2)
 
 
 def level_at(position: NDArray[np.float64]) -> mink.SO3:
-    """Return the orientation of a level gripper at ``position``, pointing away from the arm's base.
+    """Orientation of a level gripper at ``position`` (3,) m, world, pointing away from its base.
 
     Straight in front of the base this is along world -x, into the mouth of a face that looks along
     +x. Elsewhere it turns with the arm: to keep pointing along -x there, the wrist would have to
     work around its singularity, where forearm and gripper are in line.
-
-    Args:
-        position: (3,) m, world.
     """
     away = position - np.array(ARM_BASES["right"][0])
     return mink.SO3.from_z_radians(float(np.arctan2(away[1], away[0])))

@@ -310,16 +310,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return quat
 
     @property
-    def head_orientation(self) -> Floats:
-        """(4,) wxyz, world from head; identity for an upright face that looks along world +x."""
-        return self.data.mocap_quat[self._mocap["face/head"]].copy()
-
-    @property
-    def joint_names(self) -> list[str]:
-        """The columns of joint positions and velocities."""
-        return [f"{arm}/{joint}" for arm in self.observation_spec.arm_names for joint in ARM_JOINTS]
-
-    @property
     def action_names(self) -> list[str]:
         """The elements of an action."""
         return [self.model.actuator(actuator).name for actuator in self._actuators]
@@ -339,13 +329,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return None if predicted is None else predicted[self._row()].copy()
 
     def landmark_track(self, landmark: int) -> Floats:
-        """Return the true position of a point of the face now and 1 ... 5 frames ahead.
+        """(K, 3) m, world: a point of the face now and 1 ... 5 frames ahead.
 
-        Args:
-            landmark: vertex of `FaceModel`, 0 to 467, numbered as MediaPipe does.
-
-        Returns:
-            (K, 3) m, world.
+        Landmarks are vertices of `FaceModel`, 0 to 467, numbered as MediaPipe does.
         """
         start = self._row() * CONTROL_PERIOD
         displacement, orientation, jaw = self.segment.at(start + FRAMES_AHEAD)
@@ -419,7 +405,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             "end_effector_orientation": self.gripper_orientation,
             "mouth_position": self.mouth_track,
             **({} if predicted is None else {"predicted_mouth": predicted}),
-            "head_orientation": self.head_orientation,
+            # World from head; identity for an upright face that looks along world +x.
+            "head_orientation": self.data.mocap_quat[self._mocap["face/head"]].copy(),
             "jaw_opening": self.jaw_opening,
             "phase": np.int8(self.phase_names.index(self.info()["phase"])),
             "qpos": self.data.qpos.copy(),
@@ -432,7 +419,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
         A task with attributes of its own extends it.
         """
-        segment = self.segment
+        segment, arms = self.segment, self.observation_spec.arm_names
         return {
             "motion_clip": segment.clip,
             "motion_subject": segment.subject,
@@ -442,7 +429,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             "control_period": CONTROL_PERIOD,
             "prediction_period": FRAME_PERIOD,
             "phase_names": list(self.phase_names),
-            "joint_names": self.joint_names,
+            "joint_names": [f"{arm}/{joint}" for arm in arms for joint in ARM_JOINTS],
             "action_names": self.action_names,
             "xml_hash": self.xml_hash,
         }

@@ -37,11 +37,9 @@ class Phase(enum.IntEnum):
 
 
 def is_at_mouth(gripper: NDArray[np.float64], mouth: NDArray[np.float64]) -> bool:
-    """Algorithm 1's spatial condition: within 0.03, 0.01 and 0.01 m, the bounds excluded.
+    """Algorithm 1's spatial condition on two points, (3,) m, in the world frame.
 
-    Args:
-        gripper: (3,) m, world frame.
-        mouth: (3,) m, world frame.
+    They are within 0.03, 0.01 and 0.01 m of one another, the bounds excluded.
     """
     return bool(np.all(np.abs(gripper - mouth) < MOUTH_TOLERANCE))
 
