@@ -348,13 +348,10 @@ def write_episode(
         camera: np.array([image_checksum(frame) for frame in frames], dtype=np.uint32)
         for camera, frames in sorted(images.items())
     }
-    stored, loaded = _checked_attributes(
-        schema, attributes, images, len(fields["time"]), schema.version_of(fields)
-    )
+    stored, loaded = _checked_attributes(schema, attributes, images, fields)
     problems = episode_consistency(loaded, fields)
-    problems += value_problems(
-        schema.by_name["phase"], np.asarray(arrays["phase"]), len(loaded["phase_names"])
-    )
+    phase = np.asarray(arrays["phase"])
+    problems += value_problems(schema.by_name["phase"], phase, len(loaded["phase_names"]))
     if problems:
         raise ValueError(f"episode for '{path}': {'; '.join(problems)}")
     stored["content_sha256"] = stored_text(content_digest(schema, fields, checksums, loaded))
@@ -395,8 +392,7 @@ def _checked_attributes(
     schema: EpisodeSchema,
     attributes: Mapping[str, Any],
     images: EncodedImages,
-    num_steps: int,
-    version: int,
+    fields: Mapping[str, np.ndarray],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Both forms of all attributes: as HDF5 keeps them, and as they are read back."""
     given = {item.name for item in schema.attributes if not item.is_derived}
@@ -405,10 +401,11 @@ def _checked_attributes(
     if problems:
         raise ValueError(f"these attributes are no episode's: {'; '.join(problems)}")
     codec = require_choice("image codec", attributes["image_codec"], CODECS)
+    num_steps = len(fields["time"])
     values: dict[str, Any] = {
         **attributes,
         "schema": SCHEMA,
-        "schema_version": version,
+        "schema_version": schema.version_of(fields),
         "content_sha256": "",
         "num_steps": num_steps,
         "cameras": sorted(images),

@@ -62,10 +62,8 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
             problems += of_one_file
     metadata = {path: _metadata(path) for path in paths}
     problems += _mixed(metadata) + _misplaced(metadata)
-    leftover = "left by a run that was killed; may be deleted"
-    return problems + [
-        Problem(path, leftover, True) for path in sorted(folder.glob("**/.*.partial"))
-    ]
+    text, leftovers = "left by a run that was killed; may be deleted", folder.glob("**/.*.partial")
+    return problems + [Problem(path, text, True) for path in sorted(leftovers)]
 
 
 def _metadata(path: Path) -> dict[str, Any]:
@@ -187,10 +185,10 @@ def _file_problems(
         checksums[camera] = frames.checksum
         if images:
             messages += _image_problems(frames, camera, attributes)
-    if not messages and (
-        content_digest(schema, arrays, checksums, attributes) != attributes["content_sha256"]
-    ):
-        messages.append("contents do not fit 'content_sha256': something was changed")
+    if not messages:
+        digest = content_digest(schema, arrays, checksums, attributes)
+        if digest != attributes["content_sha256"]:
+            messages.append("contents do not fit 'content_sha256': something was changed")
     unknown = [f"unknown {name}" for name in _unknown(file, schema, attributes)]
     return [Problem(path, text) for text in messages] + [Problem(path, u, True) for u in unknown]
 

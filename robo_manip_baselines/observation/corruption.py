@@ -269,9 +269,7 @@ class CorruptionPipeline:
         self._seed = seed
         self._draws = self._draw(seed, _FIRST_FRAMES)
         self._steps = 0
-        self._time = np.empty(0)
-        self._position = np.empty((0, 0, 3))
-        self._predicted = np.empty((0, 0, 3))
+        self._known: list[Floats] = []  # time, target and, if there is one, predicted target
 
     def observe(self, state: State) -> TargetObservation:
         """Return the observed target of one step, from its state and those given before.
@@ -282,14 +280,12 @@ class CorruptionPipeline:
             RequestError: the error needs a predicted target, and there is none.
         """
         self._append(state)
-        time = self._time[: self._steps]
+        time, position, *predicted = (known[: self._steps] for known in self._known)
         frames = int(frame_of(time[-1])) + 1
         if frames > len(self._draws[1].last_found):
             self._draws = self._draw(self._seed, 2 * frames)
-        position, predicted = self._position[: self._steps], self._predicted[: self._steps]
-        if state.predicted_target is None:
-            predicted = None
-        observed = self._observe_at(self._draws, time, position, predicted, time[-1:])
+        forecast = predicted[0] if predicted else None
+        observed = self._observe_at(self._draws, time, position, forecast, time[-1:])
         return TargetObservation(observed.time[0], observed.position[0])
 
     def observe_episode(self, state: State, seed: int) -> TargetObservation:
@@ -332,16 +328,15 @@ class CorruptionPipeline:
         return TargetObservation(seen, observed)
 
     def _append(self, state: State) -> None:
-        if self._steps == len(self._time):
+        given = (state.time, state.target_position, state.predicted_target)
+        values = [value for value in given if value is not None]
+        if not self._known or self._steps == len(self._known[0]):
             more = max(self._steps, _FIRST_STEPS)
-            self._time = _grown(self._time, (), self._steps, more)
-            self._position = _grown(self._position, state.target_position.shape, self._steps, more)
-            if (predicted := state.predicted_target) is not None:
-                self._predicted = _grown(self._predicted, predicted.shape, self._steps, more)
-        self._time[self._steps] = state.time
-        self._position[self._steps] = state.target_position
-        if state.predicted_target is not None:
-            self._predicted[self._steps] = state.predicted_target
+            room = [np.empty((more, *np.shape(value))) for value in values]
+            pairs = zip(self._known or [array[:0] for array in room], room, strict=True)
+            self._known = [np.concatenate(pair) for pair in pairs]
+        for known, value in zip(self._known, values, strict=True):
+            known[self._steps] = value
         self._steps += 1
 
     def _draw(self, seed: int, frames: int) -> _Draws:
@@ -377,11 +372,3 @@ def draw_lost(corruption: Corruption, rng: np.random.Generator, frames: int) -> 
 def _stream(seed: int, episode: int, name: str) -> np.random.Generator:
     """Return the generator of a named stream of an episode, the same for every condition."""
     return np.random.default_rng(np.random.SeedSequence([seed, episode, *name.encode()]))
-
-
-def _grown(rows: Floats, shape: tuple[int, ...], known: int, more: int) -> Floats:
-    """Return (known + more, *shape), the first of them as in ``rows``."""
-    larger = np.empty((known + more, *shape))
-    if known:
-        larger[:known] = rows[:known]
-    return larger

@@ -32,9 +32,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def dataset(*args: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(SCRIPT), *map(str, args)], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, str(SCRIPT), *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_whole_folder(folder: Path) -> None:

@@ -53,9 +53,7 @@ def run_python(code: str, **environment: str | None) -> subprocess.CompletedProc
     merged = {**os.environ, **environment}
     kept = {key: value for key, value in merged.items() if value is not None}
     command = [sys.executable, "-c", code]
-    return subprocess.run(
-        command, env=kept, capture_output=True, text=True, check=False, timeout=120
-    )
+    return subprocess.run(command, env=kept, capture_output=True, text=True, timeout=120)
 
 
 # -- projection: no OpenGL ------------------------------------------------------------------------
@@ -327,9 +325,7 @@ def test_the_benchmark_says_how_to_get_what_it_compares_with(
     repository: Path, tmp_path: Path
 ) -> None:
     command = [sys.executable, "benchmarks/render_cameras.py", "--gym_aloha", str(tmp_path)]
-    result = subprocess.run(
-        command, cwd=repository, capture_output=True, text=True, check=False, timeout=120
-    )
+    result = subprocess.run(command, cwd=repository, capture_output=True, text=True, timeout=120)
     assert result.returncode == 2
     assert result.stdout == ""
     assert result.stderr.count("\n") == 1

@@ -59,9 +59,8 @@ def test_every_option_that_releases_have_changed_is_what_the_cell_was_tuned_with
 
 def test_names_that_scripts_lean_on(model: mujoco.MjModel) -> None:
     actuators = [model.actuator(i).name for i in range(model.nu)]
-    assert actuators == [
-        f"{arm}/{j}" for arm in ("left", "right") for j in (*ARM_JOINTS, "gripper")
-    ]
+    servos = (*ARM_JOINTS, "gripper")
+    assert actuators == [f"{arm}/{j}" for arm in ("left", "right") for j in servos]
     for arm in ("left", "right"):
         for joint in (*ARM_JOINTS, "left_finger", "right_finger"):
             model.joint(f"{arm}/{joint}")

@@ -30,9 +30,8 @@ def test_metres_follow_the_papers_equations(tmp_path: Path) -> None:
 
 
 def test_a_crop_is_smaller_than_the_picture(tmp_path: Path) -> None:
-    whole, part = (
-        load_error_stats(write_stats(tmp_path, made_up_stats(crop=crop))) for crop in (1.0, 0.25)
-    )
+    files = (write_stats(tmp_path, made_up_stats(crop=crop)) for crop in (1.0, 0.25))
+    whole, part = map(load_error_stats, files)
     for name, power in (("mean_abs", 1), ("bias", 1), ("covariance", 2)):
         smaller = getattr(whole, name) * 0.25**power
         np.testing.assert_allclose(getattr(part, name), smaller, rtol=1e-12)

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
+import cv2
 import mujoco
 import numpy as np
 
@@ -20,7 +21,6 @@ from robo_manip_baselines.envs.mujoco.face.mesh import (
     SKIN,
     Floats,
     Surface,
-    encode_png,
     paint,
     texture_coordinates,
 )
@@ -74,7 +74,8 @@ def _colour(rgb: tuple[int, int, int]) -> tuple[float, float, float, float]:
 def _add_materials(spec: mujoco.MjSpec) -> None:
     # Given as an in-memory file, not as a buffer, so that the cell can still be saved as XML.
     file = "face_texture.png"
-    spec.assets = {**spec.assets, file: encode_png(paint())}
+    png = cv2.imencode(".png", cv2.cvtColor(paint(), cv2.COLOR_RGB2BGR))[1].tobytes()
+    spec.assets = {**spec.assets, file: png}
     spec.add_texture(name="face", type=mujoco.mjtTexture.mjTEXTURE_2D, file=file)
     skin = spec.add_material(name="face/skin", specular=0.15, shininess=0.2)
     skin.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "face"
@@ -207,9 +208,8 @@ def add_collision(
     fast in the world while the mouth moves away from under it.
     """
     for owner, name, size, centre in _ELLIPSOIDS:
-        body[owner].add_geom(
-            name=f"face/{name}", type=_ELLIPSOID, size=size, pos=centre, **_OUTSIDE
-        )
+        shape = {"type": _ELLIPSOID, "size": size, "pos": centre, **_OUTSIDE}
+        body[owner].add_geom(name=f"face/{name}", **shape)
     _add_neck_and_bust(body)
     _add_lips(body, model)
     cavity = _add_cavity(spec, body["mouth"])

@@ -6,8 +6,6 @@ of points joined by strips of triangles. Legend: R rings, N points a ring. Lengt
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -324,17 +322,3 @@ def paint() -> NDArray[np.uint8]:
     for corner in _LIP_CORNERS:
         canvas.spot(LIP_LINE, at[corner], (0.002, 0.002), 0.5)
     return np.clip(canvas.image + 0.5, 0, 255).astype(np.uint8)
-
-
-def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """A PNG file of an (H, W, 3) RGB image: what MuJoCo reads textures from."""
-    height, width = image.shape[:2]
-    rows = b"".join(b"\0" + row.tobytes() for row in image)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        body = kind + data
-        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows, 6)), chunk(b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
