@@ -32,21 +32,20 @@ def recorded_state(episode: EpisodeReader) -> State:
     Raises:
         EpisodeFileError: a field is missing or damaged.
     """
-    task, gripper_position = episode.task, episode.array("gripper_position")
-    arms = gripper_position.shape[1]
-    objects = [episode.array(name)[:, None, :3] for name in task.object_fields]
+    task, array = episode.task, episode.array
+    has_prediction = task.predicted_field in episode.fields
+    by_arm = array("gripper_position").shape  # (T, A)
+    objects = [array(name)[:, None, :3] for name in task.object_fields]
     return State(
-        time=episode.array("time"),
-        joint_position=episode.array("joint_position").reshape(len(episode), arms, -1),
-        joint_velocity=episode.array("joint_velocity").reshape(len(episode), arms, -1),
-        gripper_position=gripper_position,
-        gripper_velocity=episode.array("gripper_velocity"),
-        end_effector_position=episode.array("end_effector_position"),
-        target_position=episode.array(task.target_field),
+        time=array("time"),
+        joint_position=array("joint_position").reshape(*by_arm, -1),
+        joint_velocity=array("joint_velocity").reshape(*by_arm, -1),
+        gripper_position=array("gripper_position"),
+        gripper_velocity=array("gripper_velocity"),
+        end_effector_position=array("end_effector_position"),
+        target_position=array(task.target_field),
         object_position=np.concatenate([np.empty((len(episode), 0, 3)), *objects], axis=1),
-        predicted_target=(
-            episode.array(task.predicted_field) if task.predicted_field in episode.fields else None
-        ),
+        predicted_target=array(task.predicted_field) if has_prediction else None,
     )
 
 
@@ -81,9 +80,7 @@ class Split:
             parts.append(tuple(seeds))
         train, validation = parts
         if not train or set(train) & set(validation):
-            raise RequestError(
-                "a split needs at least one training seed, and none in both of its parts"
-            )
+            raise RequestError("a split needs at least one training seed, and none in both parts")
         return cls(train, validation)
 
 
@@ -272,13 +269,12 @@ def _require_same(
     first: Path, expected: Mapping[str, Any], path: Path, given: Mapping[str, Any]
 ) -> None:
     """Raise RequestError if two files are not of one kind."""
-    ours = {**{name: expected[name] for name in POLICY_ATTRIBUTES}, "env_kwargs": _world(expected)}
-    theirs = {**{name: given[name] for name in POLICY_ATTRIBUTES}, "env_kwargs": _world(given)}
-    for name, value in ours.items():
-        if theirs[name] != value:
+    ours, theirs = ({**item, "env_kwargs": _world(item)} for item in (expected, given))
+    for name in (*POLICY_ATTRIBUTES, "env_kwargs"):
+        if theirs[name] != ours[name]:
             raise RequestError(
                 f"'{path}' has {name} {json.dumps(theirs[name])} where '{first}' has "
-                f"{json.dumps(value)}; keep episodes of one kind in one folder"
+                f"{json.dumps(ours[name])}; keep episodes of one kind in one folder"
             )
 
 
@@ -297,15 +293,13 @@ def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:
         )
     if spec.object_pose and not episode.task.names.objects:
         raise RequestError(f"object_pose: {episode.task.name} has no objects; leave it out")
-    has_prediction = episode.task.predicted_field in episode.fields
-    if spec.corruption.error == "model" and not has_prediction:
+    if spec.corruption.error == "model" and episode.task.predicted_field not in episode.fields:
         raise RequestError(f"'{path}' holds {NO_PREDICTION}")
     recorded = attributes["cameras"]
     there = ", ".join(recorded) or "none"
     # Beside, for episodes with other images do not belong into the same folder.
-    line = recording_command(
-        episode.task.name, path.parent.with_name(f"{path.parent.name}_images"), spec
-    )
+    beside = path.parent.with_name(f"{path.parent.name}_images")
+    line = recording_command(episode.task.name, beside, spec)
     missing = [camera for camera in spec.cameras if camera not in recorded]
     if missing:
         raise RequestError(

@@ -9,8 +9,7 @@ import re
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, get_args
+from typing import Any
 
 import cv2
 import h5py
@@ -33,8 +32,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, entry_of_
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import atomic_file
 
-ImageCodec = Literal["jpeg", "png", "raw"]
-CODECS: tuple[str, ...] = get_args(ImageCodec)
+CODECS = ("jpeg", "png", "raw")
 
 # At 90 the error of a rendered scene is below what a policy's image augmentation adds;
 # benchmarks/episode_io.py prints size and error for each codec.
@@ -67,12 +65,8 @@ def encode_image(
     if codec == "png":
         is_done, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     else:
-        options = [
-            cv2.IMWRITE_JPEG_QUALITY,
-            quality,
-            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
-        ]
+        sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
+        options = [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling]
         is_done, data = cv2.imencode(".jpg", bgr, options)
     if not is_done:
         raise ValueError(f"OpenCV did not encode an image of shape {image.shape} as {codec}")
@@ -80,13 +74,7 @@ def encode_image(
 
 
 def decode_image(data: np.ndarray) -> np.ndarray:
-    """Undo `encode_image`, whatever the codec.
-
-    Args:
-        data: (N,) uint8 of a JPEG or PNG file, or a raw (H, W, 3) uint8 image.
-
-    Returns:
-        (H, W, 3) uint8, RGB.
+    """Return the (H, W, 3) uint8 RGB image of which `encode_image` made ``data``, by any codec.
 
     Raises:
         ValueError: the bytes are no image.
@@ -162,12 +150,7 @@ class EpisodeReader:
     def __enter__(self) -> EpisodeReader:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __len__(self) -> int:
@@ -248,19 +231,17 @@ class FrameStore:
         group = f"{IMAGE_GROUP}/{camera}"
         self._data = dataset_of(file, f"{group}/data")
         self.checksum: np.ndarray = dataset_of(file, f"{group}/checksum")[()]
-        self._offset: np.ndarray | None = None
-        if self._data.ndim == 1:
-            self._offset = dataset_of(file, f"{group}/offset")[()]
+        is_joined = self._data.ndim == 1
+        self._offset = dataset_of(file, f"{group}/offset")[()] if is_joined else None
         frames = len(self._data) if self._offset is None else len(self._offset) - 1
         if frames != num_steps or self.checksum.shape != (num_steps,):
             raise ValueError(f"{frames} frames instead of {num_steps}")
 
     def encoded(self, step: int) -> np.ndarray:
         """One image as it was given to the writer; raises if it is not that any more."""
-        if self._offset is None:
-            data = np.asarray(self._data[step])
-        else:
-            data = np.asarray(self._data[int(self._offset[step]) : int(self._offset[step + 1])])
+        place = self._offset
+        rows = step if place is None else slice(int(place[step]), int(place[step + 1]))
+        data = np.asarray(self._data[rows])
         if image_checksum(data) != int(self.checksum[step]):
             raise ValueError("its checksum is wrong")
         return data
@@ -298,7 +279,7 @@ def require_schema(path: Path, file: h5py.File) -> None:
 
 
 def task_of(file: h5py.File) -> TaskEntry:
-    """Return the entry of the task that an episode file is of.
+    """Return the entry of the task of an episode file.
 
     Raises:
         KeyError, ValueError: the attribute ``env_id`` is missing or damaged.
@@ -326,6 +307,8 @@ def one_line(error: BaseException) -> str:
 
 # From this release of the file format on, HDF5 keeps checksums of its own structure.
 _HDF5_FORMAT = ("v110", "v110")
+
+_CHECKED: dict[str, Any] = {"fletcher32": True, "track_times": False}
 
 # Of images one after another: about one JPEG of 480 x 640, so that one frame reads one or two.
 _CHUNK_BYTES = 65536
@@ -365,28 +348,21 @@ def write_episode(
         camera: np.array([image_checksum(frame) for frame in frames], dtype=np.uint32)
         for camera, frames in sorted(images.items())
     }
-    stored, loaded = _checked_attributes(
-        schema, attributes, images, len(fields["time"]), schema.version_of(fields)
-    )
+    stored, loaded = _checked_attributes(schema, attributes, images, fields)
     problems = episode_consistency(loaded, fields)
-    problems += value_problems(
-        schema.by_name["phase"], np.asarray(arrays["phase"]), len(loaded["phase_names"])
-    )
+    phase = np.asarray(arrays["phase"])
+    problems += value_problems(schema.by_name["phase"], phase, len(loaded["phase_names"]))
     if problems:
         raise ValueError(f"episode for '{path}': {'; '.join(problems)}")
     stored["content_sha256"] = stored_text(content_digest(schema, fields, checksums, loaded))
-    with (
-        atomic_file(path) as temporary,
-        h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file,
-    ):
+    with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
         for item in schema.attributes:
             file.attrs[item.name] = stored[item.name]
         for field in schema.fields:
-            if field.name not in fields:
-                continue
-            _write_array(file, field.name, fields[field.name])
-            for name in ("unit", "frame", "description"):
-                file[field.name].attrs[name] = stored_text(getattr(field, name))
+            if field.name in fields:
+                _write_array(file, field.name, fields[field.name])
+                for name in ("unit", "frame", "description"):
+                    file[field.name].attrs[name] = stored_text(getattr(field, name))
         for camera, frames in sorted(images.items()):
             _write_frames(file, f"{IMAGE_GROUP}/{camera}", frames)
             _write_array(file, f"{IMAGE_GROUP}/{camera}/checksum", checksums[camera])
@@ -401,10 +377,8 @@ def _checked_arrays(
     problems += [f"'{name}' is no field" for name in values if name not in schema.by_name]
     problems += shape_problems(schema, {name: value.shape for name, value in values.items()})
     for field in schema.fields:
-        if field.name in values and not np.can_cast(
-            values[field.name].dtype, field.dtype, "same_kind"
-        ):
-            given = values[field.name].dtype
+        given = values[field.name].dtype if field.name in values else field.dtype
+        if not np.can_cast(given, field.dtype, "same_kind"):
             problems.append(f"'{field.name}' is {given}, not {field.dtype}")
     if not problems:
         for name, value in values.items():
@@ -418,8 +392,7 @@ def _checked_attributes(
     schema: EpisodeSchema,
     attributes: Mapping[str, Any],
     images: EncodedImages,
-    num_steps: int,
-    version: int,
+    fields: Mapping[str, np.ndarray],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Both forms of all attributes: as HDF5 keeps them, and as they are read back."""
     given = {item.name for item in schema.attributes if not item.is_derived}
@@ -428,10 +401,11 @@ def _checked_attributes(
     if problems:
         raise ValueError(f"these attributes are no episode's: {'; '.join(problems)}")
     codec = require_choice("image codec", attributes["image_codec"], CODECS)
+    num_steps = len(fields["time"])
     values: dict[str, Any] = {
         **attributes,
         "schema": SCHEMA,
-        "schema_version": version,
+        "schema_version": schema.version_of(fields),
         "content_sha256": "",
         "num_steps": num_steps,
         "cameras": sorted(images),
@@ -456,24 +430,15 @@ def _image_size(images: EncodedImages, codec: str, num_steps: int) -> tuple[int,
                 )
             if codec == "raw" and frame.shape != frames[0].shape:
                 raise ValueError(f"frame {step} of '{camera}' is {frame.shape}, unlike the first")
-        height, width, _ = decode_image(frames[0]).shape
-        sizes[camera] = (height, width)
+        sizes[camera] = decode_image(frames[0]).shape[:2]
     if len(set(sizes.values())) > 1:
         raise ValueError(f"images differ in size: {sizes}")
     return next(iter(sizes.values()), (0, 0))
 
 
 def _write_array(file: h5py.File, name: str, values: np.ndarray) -> None:
-    file.create_dataset(
-        name,
-        data=values,
-        chunks=values.shape,
-        compression="gzip",
-        compression_opts=4,
-        shuffle=True,
-        fletcher32=True,
-        track_times=False,
-    )
+    packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+    file.create_dataset(name, data=values, chunks=values.shape, **packed, **_CHECKED)
 
 
 def _write_frames(file: h5py.File, name: str, frames: Sequence[np.ndarray]) -> None:
@@ -484,9 +449,7 @@ def _write_frames(file: h5py.File, name: str, frames: Sequence[np.ndarray]) -> N
         shape, chunks = (sum(sizes),), (min(sum(sizes), _CHUNK_BYTES),)
     else:
         shape, chunks = (len(frames), *frames[0].shape), (1, *frames[0].shape)
-    dataset = file.create_dataset(
-        f"{name}/data", shape, np.uint8, chunks=chunks, fletcher32=True, track_times=False
-    )
+    dataset = file.create_dataset(f"{name}/data", shape, np.uint8, chunks=chunks, **_CHECKED)
     if frames[0].ndim == 1:
         dataset[:] = np.concatenate(frames)
     else:

@@ -39,14 +39,19 @@ def list_episodes(folder: str | Path) -> list[Path]:
     return [path for _, path in sorted(found)]
 
 
+def list_failures(folder: str | Path) -> list[Path]:
+    """The episode files in ``failed/`` of a folder by seed; none if there is no such folder."""
+    failed = Path(folder) / FAILED_FOLDER
+    return list_episodes(failed) if failed.is_dir() else []
+
+
 def finished_seeds(folder: str | Path) -> set[int]:
     """Seeds whose episode is there, as a demonstration or under ``failed/``.
 
     A killed run leaves only whole files, so a name is enough to know that a seed is done.
     """
-    folders = [part for part in (Path(folder), Path(folder) / FAILED_FOLDER) if part.is_dir()]
-    names = [path.name for part in folders for path in list_episodes(part)]
-    return {seed for name in names if (seed := seed_of(name)) is not None}
+    paths = list_episodes(folder) if Path(folder).is_dir() else []
+    return {seed for path in paths + list_failures(folder) if (seed := seed_of(path)) is not None}
 
 
 def remove_partial_episodes(folder: str | Path) -> list[Path]:

@@ -67,9 +67,8 @@ class Normalization:
         for kind in ("state", "action"):
             mean, std = vectors[f"{kind}_mean"], vectors[f"{kind}_std"]
             if len(mean) != len(std):
-                raise RequestError(
-                    f"statistics: {len(mean)} of '{kind}_mean', {len(std)} of its std"
-                )
+                given = f"{len(mean)} of '{kind}_mean', {len(std)} of its std"
+                raise RequestError(f"statistics: {given}")
             if not (std > 0.0).all():
                 raise RequestError(f"statistics: '{kind}_std' must be more than 0 everywhere")
         return cls(**vectors)
@@ -98,12 +97,9 @@ def min_max(state: Vector, action: Vector) -> Normalization:
 
 def no_normalization(state: Vector, action: Vector) -> Normalization:
     """Leave (n, S) states and (n, A) actions in their own units."""
-
-    def measure(values: Vector) -> tuple[Vector, Vector]:
-        size = values.shape[1]
-        return np.zeros(size, np.float32), np.ones(size, np.float32)
-
-    return Normalization(*measure(state), *measure(action))
+    s, a = state.shape[1], action.shape[1]
+    zeros, ones = np.zeros(max(s, a), np.float32), np.ones(max(s, a), np.float32)
+    return Normalization(zeros[:s], ones[:s], zeros[:a], ones[:a])
 
 
 METHODS: dict[str, Callable[[Vector, Vector], Normalization]] = {

@@ -17,12 +17,9 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 
-from robo_manip_baselines.envs.mujoco.tasks.registry import (
-    Attribute,
-    Field,
-    TaskEntry,
-)
+from robo_manip_baselines.envs.mujoco.tasks.registry import Attribute, Field, TaskEntry
 
 SCHEMA = "robo_manip_baselines/episode"
 SCHEMA_VERSION = 3
@@ -57,36 +54,27 @@ ALLOWED_SIZES: Mapping[str, tuple[int, ...]] = {"A": (7, 14), "J": (6, 12), "G":
 
 
 _STATE_FIELDS = (
-    Field("time", ("T",), "float64", "s", "", "Simulated time since reset", "increasing"),
+    Field("time", ("T",), "Simulated time since reset", "s", rule="increasing"),
     Field(
         "action",
         ("T", "A"),
-        "float64",
-        "rad, m",
-        "joint",
         "What was given to `env.step` after this row was observed: for each arm 6 joint targets "
         "(rad) and the finger target (m)",
+        "rad, m",
+        "joint",
     ),
-    Field("joint_position", ("T", "J"), "float64", "rad", "joint", "Arm joint angles"),
-    Field("joint_velocity", ("T", "J"), "float64", "rad/s", "joint", "Arm joint velocities"),
-    Field("gripper_position", ("T", "G"), "float64", "m", "joint", "Finger slide position"),
-    Field("gripper_velocity", ("T", "G"), "float64", "m/s", "joint", "Finger slide velocity"),
-    Field(
-        "end_effector_position",
-        ("T", 3),
-        "float64",
-        "m",
-        "world",
-        "Right gripper site: x, y, z",
-    ),
+    Field("joint_position", ("T", "J"), "Arm joint angles", "rad", "joint"),
+    Field("joint_velocity", ("T", "J"), "Arm joint velocities", "rad/s", "joint"),
+    Field("gripper_position", ("T", "G"), "Finger slide position", "m", "joint"),
+    Field("gripper_velocity", ("T", "G"), "Finger slide velocity", "m/s", "joint"),
+    Field("end_effector_position", ("T", 3), "Right gripper site: x, y, z", "m", "world"),
     Field(
         "end_effector_orientation",
         ("T", 4),
-        "float64",
+        "Right gripper site: quaternion w, x, y, z",
         "1",
         "world",
-        "Right gripper site: quaternion w, x, y, z",
-        "unit quaternion",
+        rule="unit quaternion",
     ),
 )
 """Fields of every episode, before those of the task."""
@@ -95,37 +83,24 @@ _OUTCOME_FIELDS = (
     Field(
         "phase",
         ("T",),
-        "int8",
-        "",
-        "",
         "Phase in which this row's action was chosen: index into the attribute `phase_names`",
-        "phase index",
+        dtype="int8",
+        rule="phase index",
     ),
     Field(
         "is_success",
         ("T",),
-        "bool",
-        "",
-        "",
         "Whether the task's condition held after this row's action",
+        dtype="bool",
     ),
     Field(
         "is_success_strict",
         ("T",),
-        "bool",
-        "",
-        "",
         "Whether the strict condition held after this row's action",
+        dtype="bool",
     ),
-    Field("qpos", ("T", "Q"), "float64", "m, rad, 1", "joint", "Simulator positions, all of them"),
-    Field(
-        "qvel",
-        ("T", "V"),
-        "float64",
-        "m/s, rad/s",
-        "joint",
-        "Simulator velocities, all of them",
-    ),
+    Field("qpos", ("T", "Q"), "Simulator positions, all of them", "m, rad, 1", "joint"),
+    Field("qvel", ("T", "V"), "Simulator velocities, all of them", "m/s, rad/s", "joint"),
 )
 """Fields of every episode, after those of the task."""
 
@@ -207,19 +182,15 @@ class EpisodeSchema:
         return max([self.version, *(self.by_name[name].since for name in names)])
 
     def fields_of(self, version: int, present: Iterable[str] = ()) -> tuple[str, ...]:
-        """Return the names of the fields that a file holds, or should.
+        """Return the names of the fields that a file of a schema version holds, or should.
 
-        Args:
-            version: schema version of the file.
-            present: names in the file; optional fields of version 3 and later count if there.
+        From version 3 on, optional fields count if they are among the names ``present`` in it.
         """
         found = set(present)
         return tuple(
-            field.name
-            for field in self.fields
-            if (
-                field.name in found if field.is_optional and version > 2 else field.since <= version
-            )
+            item.name
+            for item in self.fields
+            if (item.name in found if item.is_optional and version > 2 else item.since <= version)
         )
 
 
@@ -328,8 +299,7 @@ def content_digest(
     digest = hashlib.sha256()
     for field in schema.fields:
         if field.name in arrays:
-            array = np.asarray(arrays[field.name]).astype(field.dtype)
-            _add_array(digest, field.name, array)
+            _add_array(digest, field.name, np.asarray(arrays[field.name]).astype(field.dtype))
     for camera in sorted(checksums):
         _add_array(digest, camera, np.asarray(checksums[camera], dtype=np.uint32))
     for item in schema.attributes:
@@ -343,11 +313,8 @@ def episode_consistency(
 ) -> list[str]:
     """Return contradictions between attributes and arrays."""
     problems: list[str] = []
-    for name, field, axis in (
-        ("joint_names", "joint_position", 1),
-        ("action_names", "action", 1),
-        ("num_steps", "time", 0),
-    ):
+    axes = (("joint_names", "joint_position", 1), ("action_names", "action", 1))
+    for name, field, axis in (*axes, ("num_steps", "time", 0)):
         if name in attributes and field in arrays and arrays[field].ndim > axis:
             value = attributes[name]
             given = len(value) if isinstance(value, Sequence) else value
@@ -412,24 +379,22 @@ def value_problems(field: Field, values: np.ndarray, num_phases: int | None) -> 
         values: the field's array, already known to have its shape.
         num_phases: length of ``phase_names``; None leaves that rule out.
     """
-    name = field.name
+    name, rule = field.name, field.rule
+
+    def first(bad: ArrayLike, what: str) -> list[str]:
+        return [f"'{name}' {what} at step {row}" for row in np.flatnonzero(bad)[:1]]
+
     finite = np.isfinite(values)
     if not finite.all():
-        row = int(np.argwhere(~finite)[0][0])
-        return [f"'{name}' is NaN or infinite, first at step {row}"]
-    if field.rule == "increasing":
-        steps = np.flatnonzero(np.diff(values) <= 0)
-        return [f"'{name}' does not increase at step {int(steps[0]) + 1}"] if steps.size else []
-    if field.rule == "unit quaternion":
+        return first(~finite.reshape(len(values), -1).all(axis=1), "is NaN or infinite, first")
+    if rule == "increasing":
+        return first(np.diff(values, prepend=-np.inf) <= 0, "does not increase")
+    if rule == "unit quaternion":
         error = np.abs(np.linalg.norm(values[:, -4:], axis=1) - 1)
-        bad = np.flatnonzero(error > QUATERNION_TOLERANCE)
-        return [f"'{name}' is no unit quaternion at step {int(bad[0])}"] if bad.size else []
-    if field.rule == "not negative":
-        bad = np.flatnonzero(values < 0)
-        return [f"'{name}' is negative at step {int(bad[0])}"] if bad.size else []
-    if field.rule == "phase index" and num_phases is not None:
-        bad = np.flatnonzero((values < 0) | (values >= num_phases))
-        if bad.size:
-            row = int(bad[0])
-            return [f"'{name}' is {int(values[row])} at step {row}, of {num_phases} phases"]
+        return first(error > QUATERNION_TOLERANCE, "is no unit quaternion")
+    if rule == "not negative":
+        return first(values < 0, "is negative")
+    if rule == "phase index" and num_phases is not None:
+        bad = np.flatnonzero((values < 0) | (values >= num_phases))[:1]
+        return [f"'{name}' is {values[i]} at step {i}, of {num_phases} phases" for i in bad]
     return []

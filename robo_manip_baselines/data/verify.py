@@ -24,7 +24,7 @@ from robo_manip_baselines.data.episode import (
     require_schema,
     task_of,
 )
-from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes, seed_of
+from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes, list_failures, seed_of
 from robo_manip_baselines.data.schema import (
     IMAGE_GROUP,
     POLICY_ATTRIBUTES,
@@ -52,9 +52,7 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
         RequestError: if there is no such folder, or no episode in it.
     """
     folder = Path(folder)
-    paths = list_episodes(folder)
-    if (folder / FAILED_FOLDER).is_dir():
-        paths += list_episodes(folder / FAILED_FOLDER)
+    paths = list_episodes(folder) + list_failures(folder)
     if not paths:
         raise RequestError(f"'{folder}' holds no episode_*.hdf5 file")
     problems: list[Problem] = []
@@ -64,9 +62,8 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
             problems += of_one_file
     metadata = {path: _metadata(path) for path in paths}
     problems += _mixed(metadata) + _misplaced(metadata)
-    for leftover in sorted(folder.glob("**/.*.partial")):
-        problems.append(Problem(leftover, "left by a run that was killed; may be deleted", True))
-    return problems
+    text, leftovers = "left by a run that was killed; may be deleted", folder.glob("**/.*.partial")
+    return problems + [Problem(path, text, True) for path in sorted(leftovers)]
 
 
 def _metadata(path: Path) -> dict[str, Any]:
@@ -115,9 +112,7 @@ def _misplaced(metadata: dict[Path, dict[str, Any]]) -> list[Problem]:
 
 def damage_summary(folder: Path, problems: Sequence[Problem]) -> str:
     """The closing line of a verification."""
-    number = len(list_episodes(folder))
-    failed = folder / FAILED_FOLDER
-    kept = len(list_episodes(failed)) if failed.is_dir() else 0
+    number, kept = len(list_episodes(folder)), len(list_failures(folder))
     errors = [problem for problem in problems if not problem.is_warning]
     files = f"{number} demonstrations" + (f" and {kept} failures" if kept else "")
     warnings = len(problems) - len(errors)
@@ -143,9 +138,7 @@ class Problem:
 def verify_file(path: str | Path, *, images: bool = True) -> list[Problem]:
     """Everything that is wrong with one episode file; an empty list means that it is whole.
 
-    Args:
-        path: the file.
-        images: read and decode every image, too; otherwise only their number is checked.
+    With ``images``, every image is read and decoded, too; otherwise only their number is checked.
     """
     path = Path(path)
     try:
@@ -174,15 +167,13 @@ def _file_problems(
     attributes, messages = readable_attributes(file, schema)
     arrays, found = _arrays(file, schema, attributes.get("schema_version", 1))
     messages += found
-    shapes = {name: array.shape for name, array in arrays.items()}
-    wrong_shapes = shape_problems(schema, shapes)
+    wrong_shapes = shape_problems(schema, {name: a.shape for name, a in arrays.items()})
     messages += wrong_shapes
     phases = attributes.get("phase_names")
     if not wrong_shapes:
+        number = len(phases) if isinstance(phases, list) else None
         for name, array in arrays.items():
-            messages += value_problems(
-                schema.by_name[name], array, len(phases) if isinstance(phases, list) else None
-            )
+            messages += value_problems(schema.by_name[name], array, number)
         messages += episode_consistency(attributes, arrays)
     checksums: dict[str, np.ndarray] = {}
     for camera in _names(attributes.get("cameras")):
@@ -194,15 +185,12 @@ def _file_problems(
         checksums[camera] = frames.checksum
         if images:
             messages += _image_problems(frames, camera, attributes)
-    if not messages and (
-        content_digest(schema, arrays, checksums, attributes) != attributes["content_sha256"]
-    ):
-        messages.append("contents do not fit 'content_sha256': something was changed")
-    problems = [Problem(path, message) for message in messages]
-    return problems + [
-        Problem(path, f"unknown {name}", is_warning=True)
-        for name in _unknown(file, schema, attributes)
-    ]
+    if not messages:
+        digest = content_digest(schema, arrays, checksums, attributes)
+        if digest != attributes["content_sha256"]:
+            messages.append("contents do not fit 'content_sha256': something was changed")
+    unknown = [f"unknown {name}" for name in _unknown(file, schema, attributes)]
+    return [Problem(path, text) for text in messages] + [Problem(path, u, True) for u in unknown]
 
 
 def readable_attributes(file: h5py.File, schema: EpisodeSchema) -> tuple[dict[str, Any], list[str]]:
@@ -228,19 +216,20 @@ def _arrays(
     for name in schema.fields_of(version, file):
         field, dataset = schema.by_name[name], file.get(name)
         if not isinstance(dataset, h5py.Dataset):
-            problems.append(f"'{field.name}' is missing")
-        elif dataset.dtype != np.dtype(field.dtype):
-            problems.append(f"'{field.name}' is {dataset.dtype}, not {field.dtype}")
-        else:
-            try:
-                arrays[field.name] = np.asarray(dataset[()])
-            except READ_ERRORS as error:
-                problems.append(f"'{field.name}' cannot be read: {one_line(error)}")
-                continue
-            unit = dataset.attrs.get("unit", b"")
-            unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
-            if unit != field.unit:
-                problems.append(f"'{field.name}' is in {unit!r}, not in '{field.unit}'")
+            problems.append(f"'{name}' is missing")
+            continue
+        if dataset.dtype != np.dtype(field.dtype):
+            problems.append(f"'{name}' is {dataset.dtype}, not {field.dtype}")
+            continue
+        try:
+            arrays[name] = np.asarray(dataset[()])
+        except READ_ERRORS as error:
+            problems.append(f"'{name}' cannot be read: {one_line(error)}")
+            continue
+        unit = dataset.attrs.get("unit", b"")
+        unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
+        if unit != field.unit:
+            problems.append(f"'{name}' is in {unit!r}, not in '{field.unit}'")
     return arrays, problems
 
 
@@ -269,9 +258,8 @@ def _unknown(file: h5py.File, schema: EpisodeSchema, attributes: dict[str, Any])
     """Keys that the table does not know: of another release, or put there by somebody."""
     known = {*schema.by_name, IMAGE_GROUP}
     yield from (f"key '{name}'" for name in file if name not in known)
-    yield from (
-        f"attribute '{name}'" for name in file.attrs if name not in schema.attribute_by_name
-    )
+    named = schema.attribute_by_name
+    yield from (f"attribute '{name}'" for name in file.attrs if name not in named)
     cameras = set(_names(attributes.get("cameras")))
     members = file.get(IMAGE_GROUP)
     if isinstance(members, h5py.Group):

@@ -88,16 +88,15 @@ class Corruption:
             )
         if self.delay < 0:
             raise RequestError(f"delay {self.delay}: must be 0 or more frames of 1/30 s")
-        if not (math.isfinite(self.face_dropout_length) and self.face_dropout_length >= 1.0):
-            raise RequestError(
-                f"face_dropout_length {self.face_dropout_length:g}: must be 1 or more frames"
-            )
+        length = self.face_dropout_length
+        if not (math.isfinite(length) and length >= 1.0):
+            raise RequestError(f"face_dropout_length {length:g}: must be 1 or more frames")
         # Losses of that length, however close together, leave at least one frame between them.
-        most = self.face_dropout_length / (self.face_dropout_length + 1.0)
+        most = length / (length + 1.0)
         if not 0.0 <= self.face_dropout <= most:
             raise RequestError(
                 f"face_dropout {self.face_dropout:g}: must be 0 to {most:.3g}, the share of frames "
-                f"in which the face is lost, with losses of {self.face_dropout_length:g} frames"
+                f"in which the face is lost, with losses of {length:g} frames"
             )
         rate = self.detector_rate
         if rate is not None and not 0.0 < rate <= FRAME_RATE:
@@ -136,12 +135,7 @@ class Corruption:
 
     def __bool__(self) -> bool:
         """Return whether anything is corrupted."""
-        return bool(
-            self.error != "none"
-            or self.delay
-            or self.face_dropout
-            or self.detector_rate is not None
-        )
+        return self.error != "none" or bool(self.delay or self.face_dropout or self.detector_rate)
 
     @property
     def label(self) -> str:
@@ -164,15 +158,12 @@ class Corruption:
 
     def __str__(self) -> str:
         """List what differs from the defaults, in the names of the options."""
-        changed = {
-            item.name: getattr(self, item.name)
+        changed = [
+            f"{item.name} {value[:12] if item.name == 'stats_sha256' else value}"
             for item in fields(self)
-            if getattr(self, item.name) != item.default
-        }
-        return ", ".join(
-            f"{name} {value[:12] if name == 'stats_sha256' else value}"
-            for name, value in changed.items()
-        ) or ("no corruption")
+            if (value := getattr(self, item.name)) != item.default
+        ]
+        return ", ".join(changed) or "no corruption"
 
     def pinned(self) -> Corruption:
         """Return the same with the SHA-256 of its file of statistics, if it uses one.
@@ -245,13 +236,8 @@ class DetectionTiming:
         return np.where(found < frame, held, seen), found
 
 
-@dataclass(frozen=True)
-class _Draws:
-    """Random draws of an episode: errors (F, H, 3) m, world, or None; and the timing."""
-
-    frames: int
-    error: Floats | None
-    timing: DetectionTiming
+_Draws = tuple[Floats | None, DetectionTiming]
+"""Random draws of an episode: errors (F, H, 3) m, world, or None; and the timing."""
 
 
 class CorruptionPipeline:
@@ -283,39 +269,27 @@ class CorruptionPipeline:
         self._seed = seed
         self._draws = self._draw(seed, _FIRST_FRAMES)
         self._steps = 0
-        self._time = np.empty(0)
-        self._position = np.empty((0, 0, 3))
-        self._predicted = np.empty((0, 0, 3))
+        self._known: list[Floats] = []  # time, target and, if there is one, predicted target
 
     def observe(self, state: State) -> TargetObservation:
-        """Return the observed target of one step, from this state and those given before.
+        """Return the observed target of one step, from its state and those given before.
 
-        Args:
-            state: of one step, later than the step before (or the same once more).
+        A step is later than the one before, or the same once more.
 
         Raises:
             RequestError: the error needs a predicted target, and there is none.
         """
         self._append(state)
-        time = self._time[: self._steps]
+        time, position, *predicted = (known[: self._steps] for known in self._known)
         frames = int(frame_of(time[-1])) + 1
-        if frames > self._draws.frames:
+        if frames > len(self._draws[1].last_found):
             self._draws = self._draw(self._seed, 2 * frames)
-        observed = self._observe_at(
-            self._draws,
-            time,
-            self._position[: self._steps],
-            None if state.predicted_target is None else self._predicted[: self._steps],
-            time[-1:],
-        )
+        forecast = predicted[0] if predicted else None
+        observed = self._observe_at(self._draws, time, position, forecast, time[-1:])
         return TargetObservation(observed.time[0], observed.position[0])
 
     def observe_episode(self, state: State, seed: int) -> TargetObservation:
-        """Return the observed target at every step of an episode, as `observe` would have.
-
-        Args:
-            state: of the whole episode, (T, ...).
-            seed: of the episode.
+        """Return the observed target at every step, (T, ...), as `observe` would have.
 
         Raises:
             RequestError: the error needs a predicted target, and there is none.
@@ -332,20 +306,19 @@ class CorruptionPipeline:
 
         Of steps later than a moment nothing is used at that moment.
         """
-        seen, error_frame = draws.timing.seen_at(now)
+        error, timing = draws
+        seen, error_frame = timing.seen_at(now)
         row = np.searchsorted(time, seen + _TIME_ROUNDING, side="right") - 1
         after = np.minimum(row + 1, len(time) - 1)
         late = seen - time[row]
         between = late > _TIME_ROUNDING
         part = np.divide(late, time[after] - time[row], out=np.zeros_like(late), where=between)
         part = part[:, None, None]
-        # A step itself is observed bit for bit.
-        observed = np.where(
-            part > 0.0, (1.0 - part) * position[row] + part * position[after], position[row]
-        )
-        if draws.error is not None:
-            ahead = min(draws.error.shape[1], observed.shape[1] - 1)
-            observed[:, 1 : ahead + 1] += draws.error[error_frame, :ahead]
+        mixed = (1.0 - part) * position[row] + part * position[after]
+        observed = np.where(part > 0.0, mixed, position[row])  # a step itself: bit for bit
+        if error is not None:
+            ahead = min(error.shape[1], observed.shape[1] - 1)
+            observed[:, 1 : ahead + 1] += error[error_frame, :ahead]
         elif self.corruption.error == "model":
             if predicted is None:
                 raise RequestError(f"there is {NO_PREDICTION}")
@@ -355,27 +328,24 @@ class CorruptionPipeline:
         return TargetObservation(seen, observed)
 
     def _append(self, state: State) -> None:
-        if self._steps == len(self._time):
+        given = (state.time, state.target_position, state.predicted_target)
+        values = [value for value in given if value is not None]
+        if not self._known or self._steps == len(self._known[0]):
             more = max(self._steps, _FIRST_STEPS)
-            self._time = _grown(self._time, (), self._steps, more)
-            self._position = _grown(self._position, state.target_position.shape, self._steps, more)
-            if state.predicted_target is not None:
-                shape = state.predicted_target.shape
-                self._predicted = _grown(self._predicted, shape, self._steps, more)
-        self._time[self._steps] = state.time
-        self._position[self._steps] = state.target_position
-        if state.predicted_target is not None:
-            self._predicted[self._steps] = state.predicted_target
+            room = [np.empty((more, *np.shape(value))) for value in values]
+            pairs = zip(self._known or [array[:0] for array in room], room, strict=True)
+            self._known = [np.concatenate(pair) for pair in pairs]
+        for known, value in zip(self._known, values, strict=True):
+            known[self._steps] = value
         self._steps += 1
 
     def _draw(self, seed: int, frames: int) -> _Draws:
-        corruption = self.corruption
-        error = None
+        corruption, error = self.corruption, None
         if self._draw_error:
             rng = _stream(corruption.seed, seed, "error")
             error = self._draw_error(rng, frames) @ WORLD_FROM_IMAGE
         lost = draw_lost(corruption, _stream(corruption.seed, seed, "lost"), frames)
-        return _Draws(frames, error, DetectionTiming.of(corruption, lost))
+        return error, DetectionTiming.of(corruption, lost)
 
 
 def frame_of(time: ArrayLike, rate: float = FRAME_RATE) -> NDArray[np.int64]:
@@ -389,11 +359,11 @@ def draw_lost(corruption: Corruption, rng: np.random.Generator, frames: int) -> 
     A loss lasts a geometrically distributed number of frames; how often one begins follows from the
     share of frames that are lost in the long run.
     """
+    lost = np.zeros(frames, np.bool_)
     if not corruption.face_dropout:
-        return np.zeros(frames, np.bool_)
+        return lost
     length = corruption.face_dropout_length
     begins = corruption.face_dropout / ((1.0 - corruption.face_dropout) * length)
-    lost = np.zeros(frames, np.bool_)
     for frame, chance in enumerate(rng.random(frames).tolist()[1:], start=1):
         lost[frame] = chance >= 1.0 / length if lost[frame - 1] else chance < begins
     return lost
@@ -402,11 +372,3 @@ def draw_lost(corruption: Corruption, rng: np.random.Generator, frames: int) -> 
 def _stream(seed: int, episode: int, name: str) -> np.random.Generator:
     """Return the generator of a named stream of an episode, the same for every condition."""
     return np.random.default_rng(np.random.SeedSequence([seed, episode, *name.encode()]))
-
-
-def _grown(rows: Floats, shape: tuple[int, ...], known: int, more: int) -> Floats:
-    """Return (known + more, *shape), the first of them as in ``rows``."""
-    larger = np.empty((known + more, *shape))
-    if known:
-        larger[:known] = rows[:known]
-    return larger

@@ -14,12 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robo_manip_baselines.observation.error_stats import ErrorStats
+from robo_manip_baselines.observation.state import Floats
 from robo_manip_baselines.runs.errors import RequestError
 
-Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, int], Floats]
 """(generator, F) -> (F, H, 2) m."""
 
@@ -43,11 +42,8 @@ def uniform(stats: ErrorStats) -> Draw:
     how long an error lasts: here it is that of one video frame, independent of the next and of
     other horizons.
     """
-
-    def draw(rng: np.random.Generator, frames: int) -> Floats:
-        return rng.uniform(-1.0, 1.0, (frames, *stats.mean_abs.shape)) * stats.mean_abs
-
-    return draw
+    bound = stats.mean_abs
+    return lambda rng, frames: rng.uniform(-1.0, 1.0, (frames, *bound.shape)) * bound
 
 
 def gaussian(stats: ErrorStats) -> Draw:

@@ -14,15 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from robo_manip_baselines.observation.state import Floats
 from robo_manip_baselines.runs.errors import RequestError
 
 SCHEMA = "error_stats"
 VERSION = 1
 DEFAULT_STATS = Path(__file__).with_name("assets") / "error_stats.json"
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -72,10 +70,8 @@ def load_error_stats(path: str | Path | None = None, sha256: str | None = None) 
     try:
         content = source.read_bytes()
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise RequestError(
-            f"error statistics '{source}' cannot be read: {reason}; {remedy}"
-        ) from error
+        reason = f"cannot be read: {error.strerror or error}"
+        raise RequestError(f"error statistics '{source}' {reason}; {remedy}") from error
     digest = hashlib.sha256(content).hexdigest()
     if sha256 not in (None, digest):
         raise RequestError(
@@ -84,10 +80,8 @@ def load_error_stats(path: str | Path | None = None, sha256: str | None = None) 
         )
     try:
         stored = json.loads(content)
-        if not isinstance(stored, dict) or (stored.get("schema"), stored.get("version")) != (
-            SCHEMA,
-            VERSION,
-        ):
+        kind = (stored.get("schema"), stored.get("version")) if isinstance(stored, dict) else None
+        if kind != (SCHEMA, VERSION):
             raise ValueError(f"it is not '{SCHEMA}' of version {VERSION}")
         return _from_json(stored, source, digest)
     except (ValueError, KeyError, TypeError, IndexError) as error:
@@ -112,14 +106,13 @@ def _from_json(stored: Mapping[str, Any], source: Path, digest: str) -> ErrorSta
     mean_abs = _array([row["mean_abs_m"] for row in rows], "mean_abs_m", (size, 2))
     if (mean_abs < 0).any():
         raise ValueError("'mean_abs_m' must not be negative")
-    lags = _array(stored["autocorrelation"], "autocorrelation", (None, size, 2))
     return ErrorStats(
         predictor=str(stored["predictor"]),
         stride=stride,
         mean_abs=mean_abs,
         bias=_array([row["bias"] for row in rows], "bias", (size, 2)) * scale,
         covariance=covariance * np.outer(both, both),
-        autocorrelation=lags,
+        autocorrelation=_array(stored["autocorrelation"], "autocorrelation", (None, size, 2)),
         runs=tuple(
             _array(run["values"], f"residuals[{index}]", (None, size, 2)) * scale
             for index, run in enumerate(stored["residuals"])
@@ -131,11 +124,8 @@ def _from_json(stored: Mapping[str, Any], source: Path, digest: str) -> ErrorSta
 
 def _metres(camera: Mapping[str, Any]) -> Floats:
     """(2,) m that an error of one crop is, right and down: equations 6 and 7 of the paper."""
-    given = _array(
-        [camera[k] for k in ("fov_x_deg", "fov_y_deg", "crop_width", "crop_height", "depth_m")],
-        "camera",
-        (5,),
-    )
+    keys = ("fov_x_deg", "fov_y_deg", "crop_width", "crop_height", "depth_m")
+    given = _array([camera[key] for key in keys], "camera", (5,))
     fov, crop, depth = given[:2], given[2:4], given[4]
     if (given <= 0).any() or (fov >= 180).any():
         raise ValueError("'camera' must have a field of view, a crop and a depth above 0")
@@ -147,10 +137,8 @@ def _array(values: Any, key: str, shape: tuple[int | None, ...]) -> Floats:
         array = np.array(values, dtype=np.float64)
     except (ValueError, TypeError):
         raise ValueError(f"'{key}' is no table of numbers") from None
-    fits = array.ndim == len(shape) and all(
-        size >= 1 and wanted in (None, size)
-        for size, wanted in zip(array.shape, shape, strict=True)
-    )
+    fits = array.ndim == len(shape) and array.size > 0
+    fits = fits and all(want in (None, n) for n, want in zip(array.shape, shape, strict=True))
     if not fits or not np.isfinite(array).all():
         wanted = " x ".join("n" if size is None else str(size) for size in shape)
         raise ValueError(f"'{key}' must be {wanted} finite numbers")

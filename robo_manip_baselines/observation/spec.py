@@ -116,11 +116,10 @@ class ObservationSpec:
             raise RequestError(f"cameras {', '.join(self.cameras)}: each may be named once")
         if not 1 <= self.horizon <= MAX_HORIZON:
             raise RequestError(f"horizon {self.horizon}: must be 1 to {MAX_HORIZON} frames")
-        if len(self.image_size) != 2 or not all(
-            1 <= side <= MAX_IMAGE_SIZE for side in self.image_size
-        ):
+        size = self.image_size
+        if len(size) != 2 or not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
             raise RequestError(
-                f"image size {self.image_size}: must be height and width, 1 to {MAX_IMAGE_SIZE}"
+                f"image size {size}: must be height and width, 1 to {MAX_IMAGE_SIZE}"
             )
         if not self.corruption:
             object.__setattr__(self, "corruption", Corruption())
@@ -189,17 +188,14 @@ class ObservationSpec:
         """Return the names of the elements of every vector of the observation, in order."""
         parts = {"state": tuple(_state_names(self.arm_names))}
         if self.obs == "current":
-            target = names.target
-            parts[target] = (f"{target} x", f"{target} y", f"{target} z", "distance")
+            parts[names.target] = (*(f"{names.target} {axis}" for axis in "xyz"), "distance")
         if self.obs == "current_pred":
             steps = range(self.frames)
-            parts["prediction"] = tuple(
-                [f"{axis}_{k}" for k in steps for axis in "txyz"] + [f"distance_{k}" for k in steps]
-            )
+            points = [f"{axis}_{k}" for k in steps for axis in "txyz"]
+            parts["prediction"] = (*points, *(f"distance_{k}" for k in steps))
         if self.object_pose:
-            parts["object_position"] = tuple(
-                f"{item} {axis}" for item in names.objects for axis in "xyz"
-            )
+            objects = [f"{item} {axis}" for item in names.objects for axis in "xyz"]
+            parts["object_position"] = tuple(objects)
         return parts
 
     def vector_names(self, names: ObservedNames) -> list[str]:
@@ -215,15 +211,10 @@ class ObservationSpec:
         return CorruptionPipeline(self.corruption, self.frames - 1) if self.corruption else None
 
     def pack(self, state: State, target: TargetObservation | None = None) -> NDArray[np.float32]:
-        """Pack all vectors of an observation into one.
+        """Pack all vectors of an observation into one, (..., S) float32.
 
-        Args:
-            state: of any leading shape.
-            target: of the same leading shape, from the corruption pipeline; the truth if None.
-
-        Returns:
-            (..., S) float32. The distances are those from the gripper now to the target as
-            observed.
+        The target is of the corruption pipeline, and the truth if None. Distances are those from
+        the gripper now to the target as observed.
 
         Raises:
             ValueError: a target is given without a corruption, or the other way round.
@@ -231,15 +222,8 @@ class ObservationSpec:
         if (target is None) != (not self.corruption):
             raise ValueError("an observed target goes with a corruption, and only with one")
         observed = target or TargetObservation(state.time, state.target_position)
-        arms = np.concatenate(
-            [
-                state.joint_position,
-                state.joint_velocity,
-                state.gripper_position[..., None],
-                state.gripper_velocity[..., None],
-            ],
-            axis=-1,
-        )
+        gripper = np.stack([state.gripper_position, state.gripper_velocity], axis=-1)
+        arms = np.concatenate([state.joint_position, state.joint_velocity, gripper], axis=-1)
         parts = [arms.reshape(*arms.shape[:-2], -1)]
         if self.frames:
             position = observed.position[..., : self.frames, :]
@@ -274,9 +258,6 @@ class ObservationSpec:
 
 def _state_names(arms: Sequence[str]) -> list[str]:
     """Return the 14 names of each arm: positions, velocities, gripper (paper, section IV.C)."""
-    names: list[str] = []
-    for arm in arms:
-        names += [f"{arm}/{joint} position" for joint in ARM_JOINTS]
-        names += [f"{arm}/{joint} velocity" for joint in ARM_JOINTS]
-        names += [f"{arm}/gripper position", f"{arm}/gripper velocity"]
-    return names
+    names = [f"{joint} {kind}" for kind in ("position", "velocity") for joint in ARM_JOINTS]
+    names += ["gripper position", "gripper velocity"]
+    return [f"{arm}/{name}" for arm in arms for name in names]

@@ -26,19 +26,14 @@ def folder(tmp_path: Path) -> Path:
             "motion_subject": f"person {seed % 2}",
             "motion_clip": f"clip {seed % 3}",
         }
-        write_episode(
-            episode_path(tmp_path, seed, seed != 2),
-            make_arrays(10 + seed, seed),
-            make_images(10 + seed),
-            attributes,
-        )
+        path, steps = episode_path(tmp_path, seed, seed != 2), 10 + seed
+        write_episode(path, make_arrays(steps, seed), make_images(steps), attributes)
     return tmp_path
 
 
 def dataset(*args: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(SCRIPT), *map(str, args)], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, str(SCRIPT), *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_whole_folder(folder: Path) -> None:

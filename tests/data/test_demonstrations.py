@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from robo_manip_baselines.runs.errors import RequestError
 
 BLIND = ObservationSpec(obs="current_pred", cameras=(), object_pose=True)
 SHOWN = ObservationSpec(cameras=("top",), image_size=(24, 32))
+BOTH_ARMS = ObservationSpec(cameras=(), arms="both")
 
 
 def write(
@@ -80,18 +81,14 @@ def test_rows_and_indices(folder: Path) -> None:
 
 def test_two_arms(tmp_path: Path) -> None:
     write(tmp_path, 0, arms=2)
-    loaded = load_demonstrations(tmp_path, ObservationSpec(cameras=(), arms="both"))
+    loaded = load_demonstrations(tmp_path, BOTH_ARMS)
     assert loaded.state.shape == (6, 28)
     assert loaded.action.shape == (6, 14)
 
 
 def test_failures_and_leftovers_are_left_out(folder: Path) -> None:
-    write_episode(
-        episode_path(folder, 5, success=False),
-        make_arrays(),
-        {},
-        make_attributes(5) | {"is_success": False},
-    )
+    failure = make_attributes(5) | {"is_success": False}
+    write_episode(episode_path(folder, 5, success=False), make_arrays(), {}, failure)
     (folder / ".episode_000006.hdf5.1.partial").touch()
     (folder / "summary.json").touch()
     assert load_demonstrations(folder, BLIND).seeds == (3, 4, 12, 40)
@@ -155,11 +152,9 @@ def test_without_episodes_there_is_the_line_that_makes_them(tmp_path: Path, is_t
         folder.mkdir()
     line = f"python bin/Rollout.py FeedingEnv --scripted --num_episodes 50 --out '{folder}'"
     what = "holds no episode_*.hdf5 file" if is_there else "is no folder"
-    for spec, ending in (
-        (BLIND, " --cameras none"),
-        (ObservationSpec(), ""),
-        (ObservationSpec(image_size=(120, 160)), " --image_size 120x160"),
-    ):
+    small = ObservationSpec(image_size=(120, 160))
+    endings = {BLIND: " --cameras none", ObservationSpec(): "", small: " --image_size 120x160"}
+    for spec, ending in endings.items():
         with pytest.raises(RequestError) as caught:
             load_demonstrations(folder, spec, env="FeedingEnv")
         assert str(caught.value) == f"'{folder}' {what}; record it: {line}{ending}"
@@ -189,59 +184,44 @@ def test_episodes_of_two_kinds_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("make", "spec", "message"),
+    ("changes", "spec", "message"),
     [
+        ({}, BOTH_ARMS, "recorded with the arms right; arms 'both' needs left, right"),
+        ({"arms": 2}, BLIND, "recorded with the arms left, right; arms 'right' needs right"),
         (
-            lambda folder: write(folder, 0),
-            ObservationSpec(cameras=(), arms="both"),
-            "recorded with the arms right; arms 'both' needs left, right",
-        ),
-        (
-            lambda folder: write(folder, 0, arms=2),
-            BLIND,
-            "recorded with the arms left, right; arms 'right' needs right",
-        ),
-        (
-            lambda folder: write(folder, 0),
+            {},
             SHOWN,
             "no images of top; its cameras: none; choose --cameras none, or record others: "
             "python bin/Rollout.py FeedingEnv --scripted --num_episodes 50 --out .*_images "
             "--image_size 24x32$",
         ),
         (
-            lambda folder: write(folder, 0, cameras=("top", "angle")),
-            ObservationSpec(cameras=("top", "front_close"), image_size=(24, 32)),
+            {"cameras": ("top", "angle")},
+            replace(SHOWN, cameras=("top", "front_close")),
             "no images of front_close; its cameras: angle, top; choose --cameras angle top, or",
         ),
         (
-            lambda folder: write(folder, 0, cameras=("top",)),
-            ObservationSpec(cameras=("top",), image_size=(25, 32)),
+            {"cameras": ("top",)},
+            replace(SHOWN, image_size=(25, 32)),
             "image size 25x32: .* holds 24x32; choose --image_size 24x32 or less, or record: "
             ".*_images --image_size 25x32$",
         ),
-        (
-            lambda folder: write(folder, 0, cameras=("top",)),
-            ObservationSpec(cameras=("top",), image_size=(24, 33)),
-            "image size 24x33: .* holds 24x32",
-        ),
-        (
-            lambda folder: write(folder, 0, is_success=False),
-            BLIND,
-            "is a failure: move it to .*failed",
-        ),
-        (
-            lambda folder: write(folder, 0).rename(folder / "episode_000009.hdf5"),
-            BLIND,
-            "episode_000009.hdf5' holds seed 0",
-        ),
+        ({"cameras": ("top",)}, replace(SHOWN, image_size=(24, 33)), "24x33: .* holds 24x32"),
+        ({"is_success": False}, BLIND, "is a failure: move it to .*failed"),
     ],
 )
 def test_episodes_that_do_not_hold_what_is_asked_for(
-    tmp_path: Path, make: Callable[[Path], object], spec: ObservationSpec, message: str
+    tmp_path: Path, changes: dict[str, Any], spec: ObservationSpec, message: str
 ) -> None:
-    make(tmp_path)
+    write(tmp_path, 0, **changes)
     with pytest.raises(RequestError, match=message):
         load_demonstrations(tmp_path, spec)
+
+
+def test_a_renamed_episode_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, 0).rename(tmp_path / "episode_000009.hdf5")
+    with pytest.raises(RequestError, match=r"episode_000009.hdf5' holds seed 0"):
+        load_demonstrations(tmp_path, BLIND)
 
 
 def test_images_may_be_left_out_or_shrunk(tmp_path: Path) -> None:

@@ -11,19 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from robo_manip_baselines.data import (
-    EpisodeFileError,
-    EpisodeReader,
-    episode_path,
-    read_metadata,
-    write_episode,
-)
-from robo_manip_baselines.data.example import (
-    make_arrays,
-    make_attributes,
-    make_frames,
-    make_images,
-)
+from robo_manip_baselines.data import EpisodeFileError, EpisodeReader, read_metadata, write_episode
+from robo_manip_baselines.data.example import make_arrays, make_attributes, make_frames, make_images
 from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.data.verify import verify_file
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
@@ -179,9 +168,7 @@ def test_failure_while_writing_leaves_what_was_there(
 def test_units_stand_beside_the_numbers(tmp_path: Path) -> None:
     path = write_episode(tmp_path / "a.hdf5", make_arrays(), {}, make_attributes())
     with h5py.File(path) as file:
-        for field in SCHEMA.fields:
-            if field.since > 1:
-                continue
+        for field in (field for field in SCHEMA.fields if field.since == 1):
             assert file[field.name].attrs["unit"].decode() == field.unit
             assert file[field.name].attrs["frame"].decode() == field.frame
         assert file["mouth_position"].attrs["unit"] == b"m"
@@ -197,14 +184,6 @@ def test_metadata_is_read_without_images(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(h5py.Dataset, "__getitem__", forbidden)
     assert read_metadata(path)["seed"] == 3
-
-
-def _text(path: Path) -> None:
-    path.write_text("not an episode")
-
-
-def _empty(path: Path) -> None:
-    path.write_bytes(b"")
 
 
 def _truncated(path: Path) -> None:
@@ -228,8 +207,8 @@ def _future(path: Path) -> None:
     [
         (lambda path: None, "is no file"),
         (lambda path: path.mkdir(), "is no file"),
-        (_text, "is no HDF5 file"),
-        (_empty, "is no HDF5 file"),
+        (lambda path: path.write_text("not an episode"), "is no HDF5 file"),
+        (lambda path: path.write_bytes(b""), "is no HDF5 file"),
         (_truncated, "is no HDF5 file, or a damaged one: .*truncated"),
         (_other_hdf5, "is no episode: schema None"),
         (_future, "schema version 4; this release reads 1, 2, 3"),
@@ -244,9 +223,7 @@ def test_errors_name_the_file_and_why(tmp_path: Path, make: object, why: str) ->
 
 
 def test_reader_refuses_wrong_names_and_steps(tmp_path: Path) -> None:
-    path = write_episode(
-        episode_path(tmp_path, 3, True), make_arrays(), make_images(), make_attributes()
-    )
+    path = write_episode(tmp_path / "a.hdf5", make_arrays(), make_images(), make_attributes())
     with EpisodeReader(path) as episode:
         with pytest.raises(RequestError, match=r"unknown camera 'tpo' .*'top'.*front_close, top"):
             episode.frame("tpo", 0)

@@ -9,11 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.data.normalization import (
-    SMALLEST_STD,
-    Normalization,
-    mean_std,
-)
+from robo_manip_baselines.data.normalization import SMALLEST_STD, Normalization, mean_std
 from robo_manip_baselines.runs.errors import RequestError
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)

@@ -32,16 +32,8 @@ def test_every_episode_is_in_one_part(
 @pytest.mark.parametrize(
     ("episodes", "fraction", "held_out"),
     [
-        (50, 0.2, 10),
-        (50, 0.0, 0),
-        (1, 0.2, 0),
-        (1, 0.99, 0),
-        (2, 0.2, 1),
-        (3, 0.2, 1),
-        (2, 0.99, 1),
-        (9, 0.25, 2),
-        (50, 0.001, 1),
-        (50, 0.999, 49),
+        *((50, 0.2, 10), (50, 0.0, 0), (1, 0.2, 0), (1, 0.99, 0), (2, 0.2, 1)),
+        *((3, 0.2, 1), (2, 0.99, 1), (9, 0.25, 2), (50, 0.001, 1), (50, 0.999, 49)),
     ],
 )
 def test_how_many_are_held_out(episodes: int, fraction: float, held_out: int) -> None:

@@ -8,10 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from robo_manip_baselines.envs.mujoco.cell.scene import (
-    ARM_BASES,
-    CUBE_SIZE,
-)
+from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, CUBE_SIZE
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 
@@ -106,12 +103,8 @@ class Feeder:
         fingers = []
         for _ in range(round(seconds / CONTROL_PERIOD)):
             self.step()
-            fingers.append(
-                [
-                    self.data.joint("right/left_finger").qpos[0],
-                    -self.data.joint("right/right_finger").qpos[0],
-                ]
-            )
+            left, right = (self.data.joint(f"right/{side}_finger") for side in ("left", "right"))
+            fingers.append([left.qpos[0], -right.qpos[0]])
         return np.array(fingers)
 
 
@@ -179,11 +172,8 @@ def test_the_cube_lies_still_on_the_table(model: mujoco.MjModel, data: mujoco.Mj
 
 def body_pairs(model: mujoco.MjModel, data: mujoco.MjData) -> set[tuple[str, str]]:
     """Bodies in contact."""
-    bodies = model.geom_bodyid
-    return {
-        (model.body(bodies[a]).name, model.body(bodies[b]).name)
-        for a, b in data.contact.geom[: data.ncon]
-    }
+    pairs = model.geom_bodyid[data.contact.geom[: data.ncon]]
+    return {(model.body(a).name, model.body(b).name) for a, b in pairs}
 
 
 def test_at_home_nothing_touches_but_the_cube_the_table(

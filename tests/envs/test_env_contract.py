@@ -98,9 +98,8 @@ def test_no_element_of_an_observation_is_constant(env: gymnasium.Env[Any, Any]) 
 def test_every_component_is_named(env: gymnasium.Env[Any, Any]) -> None:
     components = env.unwrapped.observation_spec.components(env.unwrapped.task.names)
     spaces = env.observation_space.spaces
-    assert {key: (len(names),) for key, names in components.items()} == {
-        key: space.shape for key, space in spaces.items()
-    }
+    shapes = {key: (len(names),) for key, names in components.items()}
+    assert shapes == {key: space.shape for key, space in spaces.items()}
     for names in components.values():
         assert len(set(names)) == len(names)
 
@@ -132,9 +131,8 @@ def test_info_has_what_every_task_promises(env: gymnasium.Env[Any, Any]) -> None
 
 def test_an_entry_describes_its_environment(name: str) -> None:
     task = task_entry(name)
-    with contextlib.closing(
-        make_env(name, cameras=(), object_pose=bool(task.names.objects))
-    ) as env:
+    has_objects = bool(task.names.objects)
+    with contextlib.closing(make_env(name, cameras=(), object_pose=has_objects)) as env:
         world = world_of(env)
         observation, info = env.reset(seed=0)
         assert env.spec is not None
@@ -149,9 +147,8 @@ def test_an_entry_describes_its_environment(name: str) -> None:
         assert held - optional <= set(row) <= held
         given = {item.name for item in task.attributes}
         assert given <= set(world.start_attributes())
-        np.testing.assert_array_equal(
-            observation["state"], world.vector[: len(observation["state"])]
-        )
+        state = observation["state"]
+        np.testing.assert_array_equal(state, world.vector[: len(state)])
         metrics = task.make_metrics()
         metrics.update(info)
         failure, columns = metrics.result(info)

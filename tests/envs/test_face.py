@@ -16,12 +16,7 @@ from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
-from robo_manip_baselines.envs.mujoco.face import (
-    BODIES,
-    MAX_OPENING,
-    REST_OPENING,
-    FaceModel,
-)
+from robo_manip_baselines.envs.mujoco.face import BODIES, MAX_OPENING, REST_OPENING, FaceModel
 from robo_manip_baselines.envs.mujoco.face.mesh import face_oval
 from robo_manip_baselines.envs.mujoco.face.model import SURFACE
 from robo_manip_baselines.runs.errors import RequestError
@@ -49,15 +44,11 @@ def test_surface_has_the_size_of_an_adult_face(surface: dict[str, np.ndarray]) -
     vertices = surface["vertices"]
     assert vertices.shape == (468, 3)
 
-    def apart(*pairs: tuple[tuple[int, ...], tuple[int, ...]]) -> list[float]:
-        return [
-            float(np.linalg.norm(vertices[list(a)].mean(0) - vertices[list(b)].mean(0)))
-            for a, b in pairs
-        ]
+    def apart(a: list[int], b: list[int]) -> float:
+        return float(np.linalg.norm(vertices[a].mean(0) - vertices[b].mean(0)))
 
-    pupils, face_width, mouth_width, nose_to_chin = apart(
-        ((33, 133), (362, 263)), ((234,), (454,)), ((61,), (291,)), ((2,), (152,))
-    )
+    pupils, face_width = apart([33, 133], [362, 263]), apart([234], [454])
+    mouth_width, nose_to_chin = apart([61], [291]), apart([2], [152])
     # Farkas 1994, adults of both sexes, mean +- about three standard deviations
     assert 0.055 < pupils < 0.072
     assert 0.125 < face_width < 0.165
@@ -70,19 +61,14 @@ def test_surface_has_the_size_of_an_adult_face(surface: dict[str, np.ndarray]) -
 def test_triangles_are_consistent_and_leave_mouth_and_eyes_open(
     surface: dict[str, np.ndarray], face: FaceModel
 ) -> None:
-    directed = Counter(
-        edge for a, b, c in surface["triangles"].tolist() for edge in ((a, b), (b, c), (c, a))
-    )
+    triangles = surface["triangles"].tolist()
+    directed = Counter(edge for a, b, c in triangles for edge in ((a, b), (b, c), (c, a)))
     assert max(directed.values()) == 1  # two neighbours run along an edge in opposite directions
     border = {frozenset(edge) for edge in directed if edge[::-1] not in directed}
     rings = {name: surface[name] for name in ("lips_inner", "eye_left", "eye_right")}
     rings["outline"] = face_oval(face)
-    holes = {
-        frozenset((int(a), int(b)))
-        for ring in rings.values()
-        for a, b in zip(ring, np.roll(ring, -1), strict=True)
-    }
-    assert border == holes
+    edges = [np.stack([ring, np.roll(ring, -1)], 1).tolist() for ring in rings.values()]
+    assert border == {frozenset(edge) for ring in edges for edge in ring}
     corners = surface["vertices"][surface["triangles"]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.linalg.norm(normals, axis=1).min() > 0

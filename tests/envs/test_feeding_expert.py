@@ -29,21 +29,16 @@ def cube_in_gripper(world: FeedingEnv) -> np.ndarray:
     return gripper.inverse().apply(world.cube_position - world.gripper_position)
 
 
-def cube_touches_face(world: FeedingEnv) -> bool:
-    """Whether the inside of the mouth pushes on the cube."""
-    inside = world.model.geom_contype == MOUTH
-    return bool(inside[world.data.contact.geom].any())
-
-
 def feed(world: FeedingEnv, expert: str, seed: int) -> tuple[FeedingProgress, list[np.ndarray]]:
     """Play an episode; return how it went, and the cube in the gripper while only that held it."""
     actor = ENTRY.make_expert(expert, world)
     world.reset(seed=seed)
     actor.reset()
     carried, touched = [], False
+    inside = world.model.geom_contype == MOUTH  # the inside of the mouth, pushing on the cube
     for _ in range(600):
         _, _, terminated, _, _ = world.step(actor.act())
-        touched = touched or cube_touches_face(world)
+        touched = touched or bool(inside[world.data.contact.geom].any())
         if world.progress.phase is Phase.CARRY and not touched:
             carried.append(cube_in_gripper(world))
         if terminated:
@@ -76,9 +71,7 @@ def test_the_face_waits_for_the_lift_or_does_not(world: FeedingEnv) -> None:
         assert moved > 1e-3
     for _ in range(50):
         world.step(actor.act())
-    since = (
-        (world.step_count - lifted_at) if world.face_motion == "after_lift" else world.step_count
-    )
+    since = world.step_count - (lifted_at if world.face_motion == "after_lift" else 0)
     displacement, _, _ = world.segment.at(since * 0.02)
     np.testing.assert_allclose(world.mouth_track[0], start + displacement, atol=1e-9)
     site = world.data.site("mouth").xpos

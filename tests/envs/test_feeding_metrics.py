@@ -48,18 +48,14 @@ BELOW = float(np.nextafter(0.06, 0.0))  # m, just at the face
     ],
 )
 def test_boundaries(offset: Offset | None, released: bool, kind: str) -> None:
-    assert failure_kind(is_success=False, was_released=released, closest_offset=offset) == kind
-    assert failure_kind(is_success=True, was_released=released, closest_offset=offset) == ""
+    assert failure_kind(False, released, offset) == kind
+    assert failure_kind(True, released, offset) == ""
 
 
 def test_every_combination_of_facts_has_a_known_kind_and_every_kind_occurs() -> None:
     steps = (-0.2, -0.06, -0.03, -0.01, 0.0, 0.009, 0.01, 0.029, 0.03, 0.2)
     offsets: list[Offset | None] = [None, *itertools.product(steps, repeat=3)]
-    kinds = {
-        failure_kind(is_success=False, was_released=released, closest_offset=offset)
-        for released in (False, True)
-        for offset in offsets
-    }
+    kinds = {failure_kind(False, released, at) for released in (False, True) for at in offsets}
     assert kinds == set(ENTRY.failures)
 
 
@@ -116,9 +112,8 @@ def test_nearest_is_meant_in_units_of_the_tolerances() -> None:
 
 
 def test_without_a_lift_there_is_no_closest_approach() -> None:
-    failure, columns = metrics_of(info("grasp", (0.0, 0.5, 0.35))).result(
-        info("reach", (0.0, 0.5, 0.35))
-    )
+    at_mouth = (0.0, 0.5, 0.35)
+    failure, columns = metrics_of(info("grasp", at_mouth)).result(info("reach", at_mouth))
     assert (columns["closest_distance"], columns["closest_offset"]) == (None, None)
     assert columns["cube_offset"] is None
     assert failure == "never_grasped"

@@ -97,7 +97,12 @@ HELD = replace(NOTHING, is_held=True, is_touched=True)
 LIFTED = replace(HELD, cube_height=LIFT_HEIGHT)
 AT_MOUTH = replace(LIFTED, is_at_mouth=True, gripper_distance=0.02)
 LET_GO = replace(AT_MOUTH, is_held=False, is_touched=False, is_inside_mouth=True)
+FINGER_STAYS = replace(LET_GO, is_touched=True)
 CLEAR = replace(LET_GO, is_at_mouth=False, gripper_distance=CLEAR_DISTANCE)
+
+
+def touching(fact: StepMeasurements) -> StepMeasurements:
+    return replace(fact, touches_face=True)
 
 
 def play(*facts: StepMeasurements) -> FeedingProgress:
@@ -149,30 +154,10 @@ def test_phases(facts: tuple[StepMeasurements, ...], phase: Phase) -> None:
         ("let go outside", (LIFTED, AT_MOUTH, replace(LET_GO, is_inside_mouth=False)), True, False),
         ("let go inside", (LIFTED, AT_MOUTH, LET_GO), True, True),
         ("let go inside, never in the box", (LIFTED, LET_GO), False, False),
-        (
-            "one finger still touches",
-            (LIFTED, AT_MOUTH, replace(LET_GO, is_touched=True)),
-            True,
-            False,
-        ),
-        (
-            "lips touched on the way in",
-            (LIFTED, replace(AT_MOUTH, touches_face=True), LET_GO),
-            True,
-            False,
-        ),
-        (
-            "lips touched on the way out",
-            (LIFTED, AT_MOUTH, LET_GO, replace(CLEAR, touches_face=True)),
-            True,
-            False,
-        ),
-        (
-            "face touched before the lift only",
-            (replace(HELD, touches_face=True), LIFTED, AT_MOUTH, LET_GO),
-            True,
-            True,
-        ),
+        ("one finger still touches", (LIFTED, AT_MOUTH, FINGER_STAYS), True, False),
+        ("lips touched on the way in", (LIFTED, touching(AT_MOUTH), LET_GO), True, False),
+        ("lips touched on the way out", (LIFTED, AT_MOUTH, LET_GO, touching(CLEAR)), True, False),
+        ("touched before the lift only", (touching(HELD), LIFTED, AT_MOUTH, LET_GO), True, True),
         ("it rolls out after the release", (LIFTED, AT_MOUTH, LET_GO, NOTHING), True, True),
     ],
 )

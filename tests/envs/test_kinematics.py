@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS, JOINT_LIMITS
+from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS
 from robo_manip_baselines.envs.mujoco.expert.kinematics import (
     ORIENTATION_TOLERANCE,
     POSITION_TOLERANCE,
@@ -23,7 +23,9 @@ from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET
 from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import STANDOFF
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 
-LIMITS = np.array([JOINT_LIMITS[joint] for joint in ARM_JOINTS])
+from .test_vx300s import CHAIN
+
+LIMITS = np.array([limits for *_, limits in CHAIN])
 
 
 @pytest.fixture(scope="module", params=["left", "right"])

@@ -118,28 +118,18 @@ def test_wrong_predictions_are_refused(
 def test_interpolation_is_the_obvious_one(time: float) -> None:
     rng = np.random.default_rng(0)
     frames = 40
-    rotations = Rotation.random(1, rng=rng) * Rotation.from_rotvec(
-        0.05 * rng.standard_normal((frames, 3))
-    )
-    segment = MotionSegment(
-        fps=FPS,
-        displacement=rng.standard_normal((frames, 3)),
-        orientation=rotations.as_quat(scalar_first=True),
-        jaw=rng.random(frames),
-        clip="",
-        subject="",
-        start=0,
-        index=0,
-    )
+    first = Rotation.random(1, rng=rng)
+    rotations = first * Rotation.from_rotvec(0.05 * rng.standard_normal((frames, 3)))
+    moved, turned = rng.standard_normal((frames, 3)), rotations.as_quat(scalar_first=True)
+    segment = MotionSegment(FPS, moved, turned, rng.random(frames), "", "", start=0, index=0)
     displacement, orientation, jaw = segment.at(time)
     position = min(max(time * FPS, 0.0), frames - 1.0)
     low = min(int(position), frames - 2)
     share = position - low
     between = (1 - share) * segment.displacement[low] + share * segment.displacement[low + 1]
     np.testing.assert_allclose(displacement, between, atol=1e-9)
-    np.testing.assert_allclose(
-        jaw, (1 - share) * segment.jaw[low] + share * segment.jaw[low + 1], atol=1e-9
-    )
+    between = (1 - share) * segment.jaw[low] + share * segment.jaw[low + 1]
+    np.testing.assert_allclose(jaw, between, atol=1e-9)
     step = (rotations[low].inv() * rotations[low + 1]).as_rotvec()
     expected = rotations[low] * Rotation.from_rotvec(share * step)
     difference = expected.inv() * Rotation.from_quat(orientation, scalar_first=True)

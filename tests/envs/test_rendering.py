@@ -51,14 +51,9 @@ def data(model: mujoco.MjModel) -> mujoco.MjData:
 def run_python(code: str, **environment: str | None) -> subprocess.CompletedProcess[str]:
     """Run code in a fresh interpreter; None takes a variable away."""
     merged = {**os.environ, **environment}
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env={key: value for key, value in merged.items() if value is not None},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    kept = {key: value for key, value in merged.items() if value is not None}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=kept, capture_output=True, text=True, timeout=120)
 
 
 # -- projection: no OpenGL ------------------------------------------------------------------------
@@ -94,9 +89,8 @@ def test_project_keeps_leading_axes(model: mujoco.MjModel, data: mujoco.MjData) 
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (4, 5, 3))
     pixels = project(model, data, "above", points, (480, 640))
     assert pixels.shape == (4, 5, 2)
-    np.testing.assert_array_equal(
-        pixels[2, 3], project(model, data, "above", points[2, 3], (480, 640))
-    )
+    alone = project(model, data, "above", points[2, 3], (480, 640))
+    np.testing.assert_array_equal(pixels[2, 3], alone)
 
 
 # -- images ---------------------------------------------------------------------------------------
@@ -185,9 +179,8 @@ def test_shadows_and_multisampling_change_the_picture_only_when_asked_for(
     assert 0.001 < darkened.mean() < 0.2
     smooth = image(multisamples=4)
     # Smooth edges mix colours, on edges only.
-    assert len(np.unique(smooth.reshape(-1, 3), axis=0)) > len(
-        np.unique(plain.reshape(-1, 3), axis=0)
-    )
+    many, few = (len(np.unique(view.reshape(-1, 3), axis=0)) for view in (smooth, plain))
+    assert many > few
     assert np.mean(smooth != plain) < 0.2
 
 
@@ -241,9 +234,8 @@ def test_threads_may_take_turns(model: mujoco.MjModel, data: mujoco.MjData) -> N
 
 
 def test_unknown_camera_is_told_the_valid_ones(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    with pytest.raises(
-        RequestError, match=r"'abvoe' \(did you mean 'above'\?\); valid: above, aside"
-    ):
+    message = r"'abvoe' \(did you mean 'above'\?\); valid: above, aside"
+    with pytest.raises(RequestError, match=message):
         CameraRenderer(model, 48, 64).render(data, ["above", "abvoe"])
     with pytest.raises(RequestError, match="valid: above, aside"):
         project(model, data, "below", (0, 0, 0), (48, 64))
@@ -332,14 +324,8 @@ def test_a_forked_worker_is_told_to_open_its_own(
 def test_the_benchmark_says_how_to_get_what_it_compares_with(
     repository: Path, tmp_path: Path
 ) -> None:
-    result = subprocess.run(
-        [sys.executable, "benchmarks/render_cameras.py", "--gym_aloha", str(tmp_path)],
-        cwd=repository,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    command = [sys.executable, "benchmarks/render_cameras.py", "--gym_aloha", str(tmp_path)]
+    result = subprocess.run(command, cwd=repository, capture_output=True, text=True, timeout=120)
     assert result.returncode == 2
     assert result.stdout == ""
     assert result.stderr.count("\n") == 1

@@ -34,25 +34,8 @@ def test_releases_that_do_not_are_refused_with_what_to_do(version: str) -> None:
 def test_every_option_that_releases_have_changed_is_what_the_cell_was_tuned_with(
     model: mujoco.MjModel,
 ) -> None:
-    option = model.opt
     disabled = mujoco.mjtDisableBit
-    assert {
-        "timestep": option.timestep,
-        "integrator": option.integrator,
-        "cone": option.cone,
-        "impratio": option.impratio,
-        "solver": option.solver,
-        "jacobian": option.jacobian,
-        "iterations": option.iterations,
-        "tolerance": option.tolerance,
-        "ls_iterations": option.ls_iterations,
-        "ls_tolerance": option.ls_tolerance,
-        "noslip_iterations": option.noslip_iterations,
-        "ccd_iterations": option.ccd_iterations,
-        "ccd_tolerance": option.ccd_tolerance,
-        "enableflags": option.enableflags,
-        "disableflags": option.disableflags,
-    } == {
+    tuned = {
         "timestep": 0.002,
         "integrator": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
         "cone": mujoco.mjtCone.mjCONE_ELLIPTIC,
@@ -71,13 +54,13 @@ def test_every_option_that_releases_have_changed_is_what_the_cell_was_tuned_with
         | disabled.mjDSBL_ISLAND
         | disabled.mjDSBL_AUTORESET,
     }
+    assert {name: getattr(model.opt, name) for name in tuned} == tuned
 
 
 def test_names_that_scripts_lean_on(model: mujoco.MjModel) -> None:
     actuators = [model.actuator(i).name for i in range(model.nu)]
-    assert actuators == [
-        f"{arm}/{j}" for arm in ("left", "right") for j in (*ARM_JOINTS, "gripper")
-    ]
+    servos = (*ARM_JOINTS, "gripper")
+    assert actuators == [f"{arm}/{j}" for arm in ("left", "right") for j in servos]
     for arm in ("left", "right"):
         for joint in (*ARM_JOINTS, "left_finger", "right_finger"):
             model.joint(f"{arm}/{joint}")
@@ -107,12 +90,9 @@ def test_contact_bits(model: mujoco.MjModel) -> None:
         return int(model.geom_contype[geom]), int(model.geom_conaffinity[geom])
 
     table, cube = bits(model.geom("table").id), bits(model.geom("cube").id)
-    robot_geoms = [
-        bits(g)
-        for g in range(model.ngeom)
-        if model.body(model.geom_bodyid[g]).name.startswith(tuple(ARM_BASES))
-    ]
-    assert set(robot_geoms) == {(0, 0), (1, 3)}  # drawn, or solid
+    owners = [model.body(body).name.partition("/")[0] for body in model.geom_bodyid]
+    robot_geoms = {bits(geom) for geom, owner in enumerate(owners) if owner in ARM_BASES}
+    assert robot_geoms == {(0, 0), (1, 3)}  # drawn, or solid
     robot = (1, 3)
     face, inside = (FACE, 0), (MOUTH, 0)
     assert (SOLID, FACE, MOUTH) == (1, 2, 4)
@@ -126,11 +106,8 @@ def test_contact_bits(model: mujoco.MjModel) -> None:
 
 def test_look_at_points_the_camera_and_keeps_it_upright() -> None:
     rotation = np.empty(9)
-    for position, target in (
-        ((1, 2, 3), (0, 0, 0)),
-        ((0, 0, 1), (0, 0, 0)),
-        ((0, 1, 0), (0, 0, 2)),
-    ):
+    views = ((1, 2, 3), (0, 0, 0)), ((0, 0, 1), (0, 0, 0)), ((0, 1, 0), (0, 0, 2))
+    for position, target in views:
         mujoco.mju_quat2Mat(rotation, look_at(position, target))
         right, up, back = rotation.reshape(3, 3).T
         away = np.subtract(position, target)
@@ -155,8 +132,7 @@ def test_front_close_has_the_mouth_in_its_middle_from_about_half_a_metre(
 ) -> None:
     mouth = (0.0, 0.5, 0.35)
     camera = model.camera("front_close")
-    np.testing.assert_allclose(
-        project(model, data, "front_close", mouth, (480, 640)), (320, 240), atol=1
-    )
+    pixel = project(model, data, "front_close", mouth, (480, 640))
+    np.testing.assert_allclose(pixel, (320, 240), atol=1)
     assert np.linalg.norm(data.cam("front_close").xpos - mouth) == pytest.approx(0.55, abs=0.05)
     assert camera.fovy[0] == 47.0

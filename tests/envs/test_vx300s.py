@@ -28,86 +28,21 @@ CHAIN = (
 # ee_arm, ee_bar and ee_gripper: fixed joints ahead of the wrist_rotate frame.
 GRIPPER = (0.042825 + 0.025875 + 0.0385, 0, 0)
 
-# link, mass, centre of mass, rpy of the inertial frame, (ixx iyy izz ixy ixz iyz) in that frame
-INERTIALS = (
-    (
-        "base_link",
-        0.969034,
-        (-0.0534774000, -0.0005625750, 0.0205961000),
-        (0, 0, PI / 2),
-        (0.0060240000, 0.0017000000, 0.0071620000, 0.0000471300, 0.0000038510, -0.0000841500),
-    ),
-    (
-        "shoulder_link",
-        0.798614,
-        (0.0002592330, -0.0000033552, 0.0116129000),
-        (0, 0, PI / 2),
-        (0.0009388000, 0.0011380000, 0.0012010000, -0.0000000010, -0.0000000191, 0.0000059568),
-    ),
-    (
-        "upper_arm_link",
-        0.792592,
-        (0.0206949000, 0.0000000004, 0.2264590000),
-        (0, 0, PI / 2),
-        (0.0089250000, 0.0089370000, 0.0009357000, 0, 0, 0.0012010000),
-    ),
-    (
-        "upper_forearm_link",
-        0.322228,
-        (0.105723, 0, 0),
-        (0, 0, 0),
-        (0.0001524000, 0.0013420000, 0.0014410000, -0.0000188300, -0.0000084064, 0.0000012564),
-    ),
-    (
-        "lower_forearm_link",
-        0.414823,
-        (0.0513477000, 0.0068046200, 0),
-        (PI, 0, 0),
-        (0.0001753000, 0.0005269000, 0.0005911000, -0.0000852800, 0, 0),
-    ),
-    (
-        "wrist_link",
-        0.115395,
-        (0.0467430000, -0.0000076652, 0.0105650000),
-        (0, 0, PI / 2),
-        (0.0000463100, 0.0000451400, 0.0000527000, 0.0000000195, 0.0000000023, 0.0000042002),
-    ),
-    (
-        "gripper_link",
-        0.097666,
-        (0.0230010000, 0, 0.0115230000),
-        (0, 0, PI / 2),
-        (0.0000326800, 0.0000243600, 0.0000211900, 0, 0, 0.0000002785),
-    ),
-    (
-        "gripper_prop_link",
-        0.008009,
-        (0.0023780000, 0.0000000285, 0),
-        (0, 0, PI / 2),
-        (0.0000020386, 0.0000042979, 0.0000023796, 0, 0.0000006559, 0),
-    ),
-    (
-        "gripper_bar_link",
-        0.150986,
-        (0.0067940000, -0.0000004272, -0.0007760000),
-        (0, 0, PI / 2),
-        (0.0000789500, 0.0003283000, 0.0003095000, -0.0000000012, 0.0000001341, 0.0000017465),
-    ),
-    (
-        "left_finger_link",
-        0.034796,
-        (0.0173440000, -0.0060692000, 0),
-        (PI, PI, PI / 2),
-        (0.0000243300, 0.0000125500, 0.0000141700, -0.0000024004, 0, 0),
-    ),
-    (
-        "right_finger_link",
-        0.034796,
-        (0.0173440000, 0.0060692000, 0),
-        (0, PI, PI / 2),
-        (0.0000243300, 0.0000125500, 0.0000141700, 0.0000024001, 0, 0),
-    ),
-)
+# link, mass (kg), centre of mass (mm), rpy of the inertial frame (quarter turns), and in that frame
+# ixx iyy izz ixy ixz iyz (kg mm²)
+INERTIALS = """
+base          0.969034 -53.4774  -0.562575 20.5961 0 0 1   6024   1700   7162   47.13   3.851 -84.15
+shoulder      0.798614 0.259233 -0.0033552 11.6129 0 0 1  938.8   1138   1201  -0.001 -0.0191 5.9568
+upper_arm     0.792592  20.6949  0.0000004 226.459 0 0 1   8925   8937  935.7       0       0   1201
+upper_forearm 0.322228  105.723          0       0 0 0 0  152.4   1342   1441  -18.83 -8.4064 1.2564
+lower_forearm 0.414823  51.3477    6.80462       0 2 0 0  175.3  526.9  591.1  -85.28       0      0
+wrist         0.115395   46.743 -0.0076652  10.565 0 0 1  46.31  45.14   52.7  0.0195  0.0023 4.2002
+gripper       0.097666   23.001          0  11.523 0 0 1  32.68  24.36  21.19       0       0 0.2785
+gripper_prop  0.008009    2.378  0.0000285       0 0 0 1 2.0386 4.2979 2.3796       0  0.6559      0
+gripper_bar   0.150986    6.794 -0.0004272  -0.776 0 0 1  78.95  328.3  309.5 -0.0012  0.1341 1.7465
+left_finger   0.034796   17.344    -6.0692       0 2 2 1  24.33  12.55  14.17 -2.4004       0      0
+right_finger  0.034796   17.344     6.0692       0 0 2 1  24.33  12.55  14.17  2.4001       0      0
+""".strip().splitlines()
 
 
 def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:
@@ -115,12 +50,6 @@ def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-
-
-def from_rpy(rpy: tuple[float, float, float]) -> np.ndarray:
-    """URDF's fixed-axis roll, pitch, yaw, (3, 3)."""
-    roll, pitch, yaw = rpy
-    return rotation((0, 0, 1), yaw) @ rotation((0, 1, 0), pitch) @ rotation((1, 0, 0), roll)
 
 
 def published_gripper(angles: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -160,12 +89,9 @@ def test_joint_limits_are_the_published_ones(model: mujoco.MjModel) -> None:
     assert tuple(joint for joint, *_ in CHAIN) == ARM_JOINTS
     for arm in ARM_BASES:
         for joint, _, _, limits in CHAIN:
-            assert vx300s.JOINT_LIMITS[joint] == pytest.approx(limits, abs=1e-12)
-            for kind in (
-                model.joint(f"{arm}/{joint}").range,
-                model.actuator(f"{arm}/{joint}").ctrlrange,
-            ):
-                assert tuple(kind) == pytest.approx(limits, abs=1e-10)
+            joint_range = model.joint(f"{arm}/{joint}").range
+            for found in (joint_range, model.actuator(f"{arm}/{joint}").ctrlrange):
+                assert tuple(found) == pytest.approx(limits, abs=1e-10)
         fingers = (vx300s.FINGER_CLOSED, vx300s.FINGER_OPEN)
         assert fingers == (0.021, 0.057)
         assert tuple(model.joint(f"{arm}/left_finger").range) == fingers
@@ -174,21 +100,23 @@ def test_joint_limits_are_the_published_ones(model: mujoco.MjModel) -> None:
 
 
 def test_home_pose_is_within_the_limits() -> None:
-    for angle, joint in zip(vx300s.HOME_QPOS, ARM_JOINTS, strict=True):
-        low, high = vx300s.JOINT_LIMITS[joint]
+    for angle, (*_, (low, high)) in zip(vx300s.HOME_QPOS, CHAIN, strict=True):
         assert low < angle < high
 
 
-@pytest.mark.parametrize("inertial", INERTIALS, ids=lambda inertial: inertial[0])
-def test_masses_and_inertias_are_the_published_ones(model: mujoco.MjModel, inertial: tuple) -> None:
-    name, mass, centre, rpy, (xx, yy, zz, xy, xz, yz) = inertial
-    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    frame = from_rpy(rpy)
+@pytest.mark.parametrize("row", INERTIALS, ids=lambda row: row.split()[0])
+def test_masses_and_inertias_are_the_published_ones(model: mujoco.MjModel, row: str) -> None:
+    link, *figures = row.split()
+    mass, *numbers = map(float, figures)
+    centre, turns, (xx, yy, zz, xy, xz, yz) = numbers[:3], numbers[3:6], numbers[6:]
+    tensor = 1e-6 * np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    roll, pitch, yaw = np.array(turns) * PI / 2  # about URDF's fixed axes
+    frame = rotation((0, 0, 1), yaw) @ rotation((0, 1, 0), pitch) @ rotation((1, 0, 0), roll)
     expected = frame @ tensor @ frame.T
     for arm in ARM_BASES:
-        body = model.body(f"{arm}/{name}")
+        body = model.body(f"{arm}/{link}_link")
         assert body.mass[0] == pytest.approx(mass, rel=1e-9)
-        np.testing.assert_allclose(body.ipos, centre, atol=1e-12)
+        np.testing.assert_allclose(body.ipos, 1e-3 * np.array(centre), atol=1e-12)
         axes = np.empty(9)
         mujoco.mju_quat2Mat(axes, body.iquat)
         axes = axes.reshape(3, 3)
@@ -198,7 +126,7 @@ def test_masses_and_inertias_are_the_published_ones(model: mujoco.MjModel, inert
 
 
 def test_no_body_has_a_mass_that_was_not_published(model: mujoco.MjModel) -> None:
-    published = sum(mass for _, mass, *_ in INERTIALS)
+    published = sum(float(row.split()[1]) for row in INERTIALS)
     assert model.body_mass.sum() == pytest.approx(2 * published, rel=1e-9)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +17,15 @@ from robo_manip_baselines.observation import (
     TargetObservation,
 )
 
-HORIZONS = 5
 PERIOD = 0.02
 
 NAMES = ObservedNames("mouth", ("cube",))
-
-MakeStats = Callable[..., Path]
 
 
 def made_up_stats(
     *,
     stride: int = 1,
-    horizons: int = HORIZONS,
+    horizons: int = 5,
     runs: int = 12,
     length: int = 120,
     crop: float = 1.0,
@@ -53,6 +49,7 @@ def made_up_stats(
     covariance = gain @ gain.T
     variance = np.diag(covariance)
     camera = {"fov_x_deg": 75.0, "fov_y_deg": 47.0, "depth_m": 0.5}
+    camera |= {"crop_width": crop, "crop_height": crop}
     view = np.array([2 * 0.5 * np.tan(np.radians(angle / 2)) for angle in (75.0, 47.0)])
     mean_abs = np.abs(np.concatenate(values)).mean(axis=0)
     return {
@@ -61,14 +58,14 @@ def made_up_stats(
         "predictor": "made up",
         "fps": 30.0,
         "stride_frames": stride,
-        "camera": {**camera, "crop_width": crop, "crop_height": crop},
+        "camera": camera,
         "horizons": [
             {
                 "frames": h + 1,
-                "bias": bias.reshape(-1, 2)[h].tolist(),
-                "mean_abs_m": (mean_abs[h] * view * crop).tolist(),
+                "bias": of_bias.tolist(),
+                "mean_abs_m": (of_all * view * crop).tolist(),
             }
-            for h in range(horizons)
+            for h, (of_bias, of_all) in enumerate(zip(bias.reshape(-1, 2), mean_abs, strict=True))
         ],
         "covariance": ((covariance + covariance.T) / 2).tolist(),
         "autocorrelation": [
@@ -106,8 +103,8 @@ def wandering_truth(steps: int, seed: int = 0, *, predicted: bool = False) -> St
     )
 
 
-def step_of(truth: State, index: int | slice) -> State:
-    """One step of an episode, or some."""
+def step_of(truth: State, index: int | slice | tuple[int, ...]) -> State:
+    """One step of an episode or of a batch, or some."""
     return State(**{k: None if v is None else v[index] for k, v in vars(truth).items()})
 
 

@@ -42,9 +42,8 @@ def write_library(path: Path, *, error: float | None) -> Path:
     if error is not None:
         mouth = content["mouth"]
         ends = np.repeat(content["run_start"] + content["run_length"], content["run_length"])
-        rows = np.minimum(
-            np.arange(len(mouth))[:, None] + np.arange(1, FRAMES_AHEAD + 1), ends[:, None] - 1
-        )
+        later = np.arange(len(mouth))[:, None] + np.arange(1, FRAMES_AHEAD + 1)
+        rows = np.minimum(later, ends[:, None] - 1)
         noise = np.random.default_rng(0).normal(0.0, 1.0, (len(mouth), FRAMES_AHEAD, 3))
         content["predicted_mouth"] = (mouth[rows] + error * noise).astype(np.float32)
     np.savez_compressed(path, **content)
@@ -73,10 +72,7 @@ def recorded(folder: Path, library: Path) -> Path:
     ("obs", "corruption"),
     [
         ("current_pred", Corruption("uniform")),
-        (
-            "current_pred",
-            Corruption("empirical", delay=2, face_dropout=0.3, face_dropout_length=5.0),
-        ),
+        ("current_pred", Corruption("empirical", delay=2, face_dropout=0.3, face_dropout_length=5)),
         ("current_pred", Corruption("gaussian", detector_rate=12.0, seed=2)),
         ("current_pred", Corruption("model")),
         ("current_pred", Corruption("model", delay=4, face_dropout=0.2, detector_rate=15.0)),
@@ -115,9 +111,8 @@ def test_the_world_is_the_same_with_and_without(library: Path) -> None:
     """What is shown differs, what happens does not: no draw is taken from the world's generator."""
     tracks = []
     for corruption in (None, {"error": "uniform", "face_dropout": 0.2}):
-        with closing(
-            make_env("FeedingEnv", obs="current_pred", cameras=(), corruption=corruption)
-        ) as env:
+        kwargs = {"obs": "current_pred", "cameras": (), "corruption": corruption}
+        with closing(make_env("FeedingEnv", **kwargs)) as env:
             env.reset(seed=9)
             rows = []
             for _ in range(20):

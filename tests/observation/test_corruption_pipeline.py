@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,12 @@ MEASURED = ("uniform", "gaussian", "empirical")
 def step_by_step(detector: CorruptionPipeline, truth: State, seed: int) -> TargetObservation:
     detector.reset(seed)
     reports = [detector.observe(step_of(truth, index)) for index in range(len(truth.time))]
-    return TargetObservation(
-        *map(np.stack, zip(*((r.time, r.position) for r in reports), strict=True))
-    )
+    time, position = zip(*((r.time, r.position) for r in reports), strict=True)
+    return TargetObservation(np.stack(time), np.stack(position))
+
+
+def corrupted(corruption: Corruption, truth: State, seed: int = 0) -> TargetObservation:
+    return CorruptionPipeline(corruption).observe_episode(truth, seed)
 
 
 def assert_same(one: TargetObservation, other: TargetObservation) -> None:
@@ -69,23 +73,20 @@ def test_nothing_of_later_steps_is_used(corruption: Corruption, steps: int, cut:
     cut = min(cut, steps - 1)
     truth = wandering_truth(steps, predicted=True)
     assert truth.predicted_target is not None
-    whole = CorruptionPipeline(corruption).observe_episode(truth, 1)
+    whole = corrupted(corruption, truth, 1)
     truth.target_position[cut:] += 100.0
     truth.predicted_target[cut:] -= 100.0
-    other = CorruptionPipeline(corruption).observe_episode(truth, 1)
+    other = corrupted(corruption, truth, 1)
     np.testing.assert_array_equal(other.position[:cut], whole.position[:cut])
-    assert (
-        not np.array_equal(other.position[-1], whole.position[-1])
-        or whole.time[-1] < truth.time[cut]
-    )
+    is_changed = not np.array_equal(other.position[-1], whole.position[-1])
+    assert is_changed or whole.time[-1] < truth.time[cut]
 
 
 def test_an_episode_may_be_longer_than_what_is_drawn_at_first() -> None:
     truth = wandering_truth(2200)  # 44 s
     for error in ("empirical", "gaussian"):
-        detector = CorruptionPipeline(
-            Corruption(error=error, delay=2, face_dropout=0.2, detector_rate=7.0)
-        )
+        corruption = Corruption(error, delay=2, face_dropout=0.2, detector_rate=7.0)
+        detector = CorruptionPipeline(corruption)
         assert_same(step_by_step(detector, truth, 4), detector.observe_episode(truth, 4))
 
 
@@ -100,8 +101,7 @@ def test_looking_twice_changes_nothing() -> None:
 @pytest.mark.parametrize("error", MEASURED)
 def test_an_error_lies_in_the_image_plane_and_lasts_a_frame(stats_file: Path, error: str) -> None:
     truth = wandering_truth(200)
-    corruption = Corruption(error=error, error_stats=str(stats_file))
-    shown = CorruptionPipeline(corruption).observe_episode(truth, 3)
+    shown = corrupted(Corruption(error, str(stats_file)), truth, 3)
     added = shown.position - truth.target_position
     np.testing.assert_array_equal(shown.time, truth.time)
     np.testing.assert_array_equal(added[:, 0], 0.0)  # now: the detector's, not the forecast's
@@ -122,10 +122,7 @@ def test_what_is_injected_is_what_the_paper_injects(tmp_path: Path) -> None:
         row["mean_abs_m"] = [0.0115, 0.0074]
     stats = str(write_stats(tmp_path, content))
     truth = wandering_truth(20_000)
-    corruption = Corruption(error="uniform", error_stats=stats)
-    added = (
-        CorruptionPipeline(corruption).observe_episode(truth, 0).position - truth.target_position
-    )
+    added = corrupted(Corruption("uniform", stats), truth).position - truth.target_position
     most = np.abs(added).max(axis=0)[1:]
     np.testing.assert_allclose(most[:, 1:], np.tile([0.0115, 0.0074], (5, 1)), rtol=2e-3)
 
@@ -137,10 +134,7 @@ def test_right_in_the_image_is_plus_y_and_down_is_minus_z(tmp_path: Path) -> Non
         row["bias"] = [0.01, 0.02]  # right and down
     stats = str(write_stats(tmp_path, content))
     truth = wandering_truth(3)
-    corruption = Corruption(error="gaussian", error_stats=stats)
-    added = (
-        CorruptionPipeline(corruption).observe_episode(truth, 0).position - truth.target_position
-    )
+    added = corrupted(Corruption("gaussian", stats), truth).position - truth.target_position
     metres = load_error_stats(stats).bias[0]
     for k in range(1, 6):
         np.testing.assert_allclose(added[:, k], [[0.0, metres[0], -metres[1]]] * 3, atol=1e-12)
@@ -152,7 +146,7 @@ def test_every_arm_has_the_same_errors() -> None:
 
     def shown(**more: float) -> TargetObservation:
         corruption = Corruption(error="gaussian", **more)  # pyright: ignore[reportArgumentType]
-        return CorruptionPipeline(corruption).observe_episode(truth, 11)
+        return corrupted(corruption, truth, 11)
 
     plain, late = shown(), shown(delay=3)  # 5 steps
     np.testing.assert_allclose(late.position[5:], plain.position[:-5], atol=1e-12)
@@ -165,35 +159,26 @@ def test_every_arm_has_the_same_errors() -> None:
     found[:-1] &= np.diff(lost.time) > 0  # but for the very moments at which it gets lost
     assert 0.5 < found.mean() < 1.0
     np.testing.assert_array_equal(lost.position[found], plain.position[found])
-    spec = {
-        horizon: ObservationSpec(
-            obs="current_pred", horizon=horizon, cameras=(), corruption=Corruption("gaussian")
-        )
-        for horizon in (2, 5)
-    }
-    near, far = (observe(spec[h], truth, plain)["prediction"] for h in (2, 5))
+    two = ObservationSpec("current_pred", 2, cameras=(), corruption=Corruption("gaussian"))
+    five = replace(two, horizon=5)
+    near, far = (observe(spec, truth, plain)["prediction"] for spec in (two, five))
     np.testing.assert_array_equal(near[:, :12], far[:, :12])
 
 
 def test_errors_are_drawn_from_the_episodes_seed() -> None:
     truth = wandering_truth(60)
     for corruption in (Corruption("uniform"), Corruption(face_dropout=0.4)):
-        again = [
-            CorruptionPipeline(corruption).observe_episode(truth, seed).position
-            for seed in (0, 0, 1)
-        ]
+        again = [corrupted(corruption, truth, seed).position for seed in (0, 0, 1)]
         np.testing.assert_array_equal(again[0], again[1])
         assert not np.array_equal(again[0], again[2])
-        other = Corruption(**{**vars(corruption), "seed": 1})
-        assert not np.array_equal(
-            CorruptionPipeline(other).observe_episode(truth, 0).position, again[0]
-        )
+        other = corrupted(replace(corruption, seed=1), truth).position
+        assert not np.array_equal(other, again[0])
 
 
 def test_the_predictors_own_output_is_shown_at_video_frames() -> None:
     truth = wandering_truth(61, predicted=True)
     assert truth.predicted_target is not None
-    shown = CorruptionPipeline(Corruption("model")).observe_episode(truth, 0)
+    shown = corrupted(Corruption("model"), truth)
     np.testing.assert_array_equal(shown.position[:, 0], truth.target_position[:, 0])
     every = np.arange(0, 61, 5)  # frames 0, 3, 6 ...
     np.testing.assert_allclose(shown.position[every, 1:], truth.predicted_target[every], atol=1e-12)
@@ -201,9 +186,8 @@ def test_the_predictors_own_output_is_shown_at_video_frames() -> None:
     error = shown.position[:, 1:] - truth.target_position[:, 1:]
     np.testing.assert_allclose(error[1], error[0], atol=1e-12)
     np.testing.assert_allclose(error[3], error[2], atol=1e-12)
-    np.testing.assert_allclose(
-        error[2], truth.predicted_target[2] - truth.target_position[2, 1:], atol=1e-12
-    )
+    made = truth.predicted_target[2] - truth.target_position[2, 1:]
+    np.testing.assert_allclose(error[2], made, atol=1e-12)
 
 
 def test_without_predictions_the_model_has_nothing_to_show() -> None:
@@ -218,9 +202,8 @@ def test_without_predictions_the_model_has_nothing_to_show() -> None:
 def test_statistics_must_reach_as_far_as_what_is_shown(tmp_path: Path) -> None:
     stats = str(write_stats(tmp_path, made_up_stats(horizons=3)))
     for horizon in (1, 3, 4):
-        spec = ObservationSpec(
-            obs="current_pred", horizon=horizon, corruption=Corruption("uniform", stats)
-        )
+        corruption = Corruption("uniform", stats)
+        spec = ObservationSpec("current_pred", horizon, corruption=corruption)
         if horizon <= 3:
             assert spec.make_pipeline()
             continue
@@ -233,7 +216,7 @@ def test_a_report_is_shown_with_its_time_and_the_gripper_of_now() -> None:
     truth = wandering_truth(30)
     corruption = Corruption(delay=3)
     spec = ObservationSpec(obs="current_pred", horizon=1, cameras=(), corruption=corruption)
-    report = CorruptionPipeline(corruption).observe_episode(truth, 0)
+    report = corrupted(corruption, truth)
     shown = observe(spec, truth, report)["prediction"]
     assert shown.shape == (30, 10)
     late = step_of(truth, slice(0, 25))
@@ -244,10 +227,8 @@ def test_a_report_is_shown_with_its_time_and_the_gripper_of_now() -> None:
     np.testing.assert_allclose(shown[5:, 9], np.linalg.norm(apart, axis=1), rtol=1e-6)
     current = ObservationSpec(obs="current", cameras=(), corruption=corruption)
     np.testing.assert_array_equal(observe(current, truth, report)["mouth"][:, :3], shown[:, 1:4])
-    np.testing.assert_array_equal(
-        observe(current, truth, report)["state"],
-        observe(ObservationSpec(cameras=()), truth)["state"],
-    )
+    plain = observe(ObservationSpec(cameras=()), truth)
+    np.testing.assert_array_equal(observe(current, truth, report)["state"], plain["state"])
     for wrong in ((spec, None), (ObservationSpec(), report)):
         with pytest.raises(ValueError, match="goes with a corruption"):
             observe(wrong[0], truth, wrong[1])

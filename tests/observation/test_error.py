@@ -75,9 +75,8 @@ def test_gaussian_has_the_files_statistics(stats: ErrorStats) -> None:
     deviation = np.sqrt(np.diag(stats.covariance)).reshape(-1, 2)
     np.testing.assert_allclose((drawn.mean(axis=0) - stats.bias) / deviation, 0.0, atol=slow)
     assert_covariances_agree(drawn, stats.covariance, slow)
-    np.testing.assert_allclose(
-        correlation(drawn, stats.stride), stats.autocorrelation[1], atol=slow
-    )
+    found = correlation(drawn, stats.stride)
+    np.testing.assert_allclose(found, stats.autocorrelation[1], atol=slow)
     # Normal: the mean absolute error follows, and a twentieth is beyond 1.96 deviations.
     beyond = np.abs(drawn - stats.bias) > 1.96 * deviation
     np.testing.assert_allclose(beyond.mean(axis=0), 0.05, atol=slow / 4)
@@ -88,9 +87,8 @@ def test_gaussian_has_the_files_statistics(stats: ErrorStats) -> None:
 def test_empirical_has_the_statistics_of_the_files_runs(stats: ErrorStats) -> None:
     drawn, pool = draw("empirical", stats), np.concatenate(stats.runs)
     slow = CLOSE * np.sqrt(stats.stride)
-    np.testing.assert_allclose(
-        (drawn.mean(axis=0) - pool.mean(axis=0)) / pool.std(axis=0), 0.0, atol=slow
-    )
+    bias = (drawn.mean(axis=0) - pool.mean(axis=0)) / pool.std(axis=0)
+    np.testing.assert_allclose(bias, 0.0, atol=slow)
     ratio = np.abs(drawn).mean(axis=0) / np.abs(pool).mean(axis=0)
     np.testing.assert_allclose(ratio, 1.0, atol=slow)
     for phase in range(stats.stride):  # the same between forecasts as at them
@@ -100,9 +98,8 @@ def test_empirical_has_the_statistics_of_the_files_runs(stats: ErrorStats) -> No
     assert_covariances_agree(at_forecasts, covariance(pool), slow)
     length = -(-BLOCK_FRAMES // stats.stride)
     followed = np.mean([correlation(run, 1) for run in stats.runs], axis=0)
-    np.testing.assert_allclose(
-        correlation(at_forecasts, 1), followed * (length - 1) / length, atol=slow + 0.05
-    )
+    wanted = followed * (length - 1) / length
+    np.testing.assert_allclose(correlation(at_forecasts, 1), wanted, atol=slow + 0.05)
 
 
 def test_empirical_plays_whole_blocks_of_what_was_measured(stats: ErrorStats) -> None:

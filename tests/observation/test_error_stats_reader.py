@@ -25,19 +25,16 @@ def test_metres_follow_the_papers_equations(tmp_path: Path) -> None:
     wide = load_error_stats(write_stats(tmp_path, {**content, "covariance": np.eye(10).tolist()}))
     view = np.array([0.7673, 0.4348])  # m, what that camera sees at 0.5 m
     np.testing.assert_allclose(np.diag(wide.covariance), np.tile(view, 5) ** 2, rtol=1e-3)
-    np.testing.assert_allclose(
-        stats.runs[3], np.array(content["residuals"][3]["values"]) * view, rtol=1e-3
-    )
+    run = np.array(content["residuals"][3]["values"])
+    np.testing.assert_allclose(stats.runs[3], run * view, rtol=1e-3)
 
 
 def test_a_crop_is_smaller_than_the_picture(tmp_path: Path) -> None:
-    whole, part = (
-        load_error_stats(write_stats(tmp_path, made_up_stats(crop=crop))) for crop in (1.0, 0.25)
-    )
+    files = (write_stats(tmp_path, made_up_stats(crop=crop)) for crop in (1.0, 0.25))
+    whole, part = map(load_error_stats, files)
     for name, power in (("mean_abs", 1), ("bias", 1), ("covariance", 2)):
-        np.testing.assert_allclose(
-            getattr(part, name), getattr(whole, name) * 0.25**power, rtol=1e-12
-        )
+        smaller = getattr(whole, name) * 0.25**power
+        np.testing.assert_allclose(getattr(part, name), smaller, rtol=1e-12)
     np.testing.assert_allclose(part.runs[0], whole.runs[0] * 0.25, rtol=1e-12)
 
 

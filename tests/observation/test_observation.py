@@ -12,21 +12,16 @@ from hypothesis import strategies as st
 from robo_manip_baselines.observation import ObservationSpec, State
 from robo_manip_baselines.runs.errors import RequestError
 
-from .conftest import NAMES, observe
+from .conftest import NAMES, observe, step_of
+
+POINTS = ((3,), (6, 3), (1, 3))
+"""Shapes of gripper, target and objects."""
 
 
 def truth(shape: tuple[int, ...], arms: int, seed: int = 0) -> State:
-    rng = np.random.default_rng(seed)
-    return State(
-        time=rng.random(shape),
-        joint_position=rng.random((*shape, arms, 6)),
-        joint_velocity=rng.random((*shape, arms, 6)),
-        gripper_position=rng.random((*shape, arms)),
-        gripper_velocity=rng.random((*shape, arms)),
-        end_effector_position=rng.random((*shape, 3)),
-        target_position=rng.random((*shape, 6, 3)),
-        object_position=rng.random((*shape, 1, 3)),
-    )
+    rng, by_arm = np.random.default_rng(seed), (*shape, arms)
+    sizes = [shape, (*by_arm, 6), (*by_arm, 6), by_arm, by_arm, *((*shape, *n) for n in POINTS)]
+    return State(*(np.asarray(rng.random(size)) for size in sizes))
 
 
 def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
@@ -74,36 +69,28 @@ def test_observe_is_what_the_tables_say(spec: ObservationSpec, seed: int) -> Non
         assert len(spec.components(NAMES)[key]) == value.shape[0]
 
 
-def member(batch: State, *index: int) -> State:
-    return State(**{k: None if v is None else v[index] for k, v in vars(batch).items()})
-
-
 @given(specs)
 def test_a_batch_is_its_members(spec: ObservationSpec) -> None:
-    arms = len(spec.arm_names)
-    batch = truth((3, 4), arms)
+    batch = truth((3, 4), len(spec.arm_names))
     together = observe(spec, batch)
-    for i in range(3):
-        for j in range(4):
-            alone = observe(spec, member(batch, i, j))
-            for key in alone:
-                np.testing.assert_array_equal(alone[key], together[key][i, j])
+    for index in np.ndindex(3, 4):
+        for key, alone in observe(spec, step_of(batch, index)).items():
+            np.testing.assert_array_equal(alone, together[key][index])
 
 
-def test_sizes_of_the_papers_presets() -> None:
-    sizes = {
-        (obs, horizon): {
-            key: len(names)
-            for key, names in ObservationSpec(obs=obs, horizon=horizon).components(NAMES).items()
-        }
-        for obs in ("baseline", "current", "current_pred")
-        for horizon in (1, 2, 5)
-    }
-    assert sizes["baseline", 2] == {"state": 14}
-    assert sizes["current", 2] == {"state": 14, "mouth": 4}
-    assert sizes["current_pred", 1] == {"state": 14, "prediction": 10}
-    assert sizes["current_pred", 2] == {"state": 14, "prediction": 15}
-    assert sizes["current_pred", 5] == {"state": 14, "prediction": 30}
+@pytest.mark.parametrize(
+    ("obs", "horizon", "sizes"),
+    [
+        ("baseline", 2, {"state": 14}),
+        ("current", 2, {"state": 14, "mouth": 4}),
+        ("current_pred", 1, {"state": 14, "prediction": 10}),
+        ("current_pred", 2, {"state": 14, "prediction": 15}),
+        ("current_pred", 5, {"state": 14, "prediction": 30}),
+    ],
+)
+def test_sizes_of_the_papers_presets(obs: str, horizon: int, sizes: dict[str, int]) -> None:
+    components = ObservationSpec(obs=obs, horizon=horizon).components(NAMES)
+    assert {key: len(names) for key, names in components.items()} == sizes
 
 
 @pytest.mark.parametrize(

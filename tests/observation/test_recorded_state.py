@@ -38,12 +38,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_file_read_with_a_preset_is_what_the_environment_shows(
     recorded: Path, spec: ObservationSpec
 ) -> None:
-    with (
-        EpisodeReader(recorded) as episode,
-        closing(
-            remake_env(episode, obs=spec.obs, horizon=spec.horizon, object_pose=spec.object_pose)
-        ) as env,
-    ):
+    kwargs = {"obs": spec.obs, "horizon": spec.horizon, "object_pose": spec.object_pose}
+    with EpisodeReader(recorded) as episode, closing(remake_env(episode, **kwargs)) as env:
         read = observe(spec, recorded_state(episode))
         shown, _ = env.reset(seed=episode.attributes["seed"])
         for step, action in enumerate(episode.array("action")):

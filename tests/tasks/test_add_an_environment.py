@@ -46,9 +46,8 @@ def test_the_page_names_methods_that_exist() -> None:
     table = PAGE.read_text().partition("| method | purpose |")[2].partition("\n\n")[0]
     names = re.findall(r"^\| `(\w+)\(", table, re.M)
     assert len(names) >= 8
-    section = (
-        inspect.getsource(FaceEnv).partition("# -- task --")[2].partition("# -- indices --")[0]
-    )
+    source = inspect.getsource(FaceEnv).partition("# -- task --")[2]
+    section = source.partition("# -- indices --")[0]
     in_section = set(re.findall(r"def (\w+)\(", section))
     assert in_section - {"predicted_target"} == set(names) - {"start_attributes"}
 
@@ -155,11 +154,6 @@ def run_python(
 ) -> subprocess.CompletedProcess[str]:
     """Run Python where the package of the page is installed."""
     path = [site, TASKS, ROOT, *([more] if more else [])]
-    return subprocess.run(
-        [sys.executable, *args],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
+    command = [sys.executable, *args]
+    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)

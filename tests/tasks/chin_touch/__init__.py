@@ -27,10 +27,9 @@ ENTRY = TaskEntry(
         Field(
             "chin_position",
             ("T", 6, 3),
-            "float64",
+            "True chin now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
             "m",
             "world",
-            "True chin now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
         ),
     ),
     attributes=FACE_ATTRIBUTES,

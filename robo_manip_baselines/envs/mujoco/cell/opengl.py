@@ -24,7 +24,6 @@ APT_PACKAGES: dict[str, tuple[str, ...]] = {
     "osmesa": ("libosmesa6",),
     "glfw": ("libgl1", "libgl1-mesa-dri"),
 }
-DEFAULT_BACKEND = "egl"
 PROBE_TIMEOUT = 120.0  # seconds; a cold start of software rendering takes about two
 
 # Draws a red ball, off screen, in a process of its own: a backend is chosen once per process, and
@@ -47,7 +46,7 @@ renderer.close()
 
 def backend_in_use() -> str:
     """Return the backend that rendering will use: ``$MUJOCO_GL``, else EGL."""
-    return os.environ.get("MUJOCO_GL", "").strip().lower() or DEFAULT_BACKEND
+    return os.environ.get("MUJOCO_GL", "").strip().lower() or "egl"
 
 
 def apt_line(backend: str) -> str:
@@ -81,9 +80,10 @@ def _probe(backend: str) -> tuple[str, str | None]:
     if backend not in APT_PACKAGES:
         return "", f"MUJOCO_GL={backend} renders nothing; valid: {', '.join(APT_PACKAGES)}"
     environment = os.environ | {"MUJOCO_GL": backend}
+    command = [sys.executable, "-c", _PROBE]
     try:
         probe = subprocess.run(
-            [sys.executable, "-c", _PROBE],
+            command,
             env=environment,
             capture_output=True,
             text=True,

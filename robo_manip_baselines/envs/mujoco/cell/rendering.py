@@ -129,10 +129,8 @@ class _Target:
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = settings.shadows
         # Each of these draws the scene, or a backdrop, once more.
-        flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
-        flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
-        flags[mujoco.mjtRndFlag.mjRND_FOG] = False
+        for name in ("REFLECTION", "SKYBOX", "HAZE", "FOG"):
+            flags[getattr(mujoco.mjtRndFlag, f"mjRND_{name}")] = False
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
@@ -142,9 +140,7 @@ class _Target:
     def current(self) -> Iterator[None]:
         """Make the context this thread's, and let go of it afterwards."""
         if os.getpid() != self._process:
-            raise RuntimeError(
-                "this renderer was opened before the process forked; open one in each worker"
-            )
+            raise RuntimeError("renderer opened before the process forked; open one in each worker")
         self._gl.make_current()
         try:
             yield
@@ -159,10 +155,8 @@ class _Target:
         for i, number in enumerate(cameras):
             self._camera.fixedcamid = number
             if i == 0:
-                everything = mujoco.mjtCatBit.mjCAT_ALL.value
-                mujoco.mjv_updateScene(
-                    model, data, self._option, None, self._camera, everything, self._scene
-                )
+                scene = (self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
+                mujoco.mjv_updateScene(model, data, self._option, None, *scene)
             else:
                 mujoco.mjv_updateCamera(model, data, self._camera, self._scene)
                 mujoco.mjv_makeLights(model, data, self._scene)  # the headlight is the camera's
@@ -215,10 +209,8 @@ def _make_context(model: mujoco.MjModel, height: int, width: int) -> tuple[Any, 
     except Exception as error:  # each backend fails in a way of its own, down to AttributeError
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         fix = f"; run: {apt_line(backend)}" if backend in APT_PACKAGES else ""
-        raise RequestError(
-            f"no OpenGL to draw cameras with ({backend}: {reason}){fix} "
-            "(--cameras none needs no OpenGL)"
-        ) from error
+        problem = f"no OpenGL to draw cameras with ({backend}: {reason}){fix}"
+        raise RequestError(f"{problem} (--cameras none needs no OpenGL)") from error
 
 
 def _let_go() -> None:
@@ -257,9 +249,8 @@ def project_points(
         the centre of the first pixel is (0.5, 0.5). Points out of view are outside the image;
         points that are not in front of the camera are NaN.
     """
-    in_camera = (np.asarray(points, float) - np.asarray(position, float)) @ np.asarray(
-        orientation, float
-    )
+    from_camera = np.asarray(points, float) - np.asarray(position, float)
+    in_camera = from_camera @ np.asarray(orientation, float)
     depth = -in_camera[..., 2:]
     focal = height / 2 / math.tan(math.radians(fovy) / 2)  # pixels
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -288,10 +279,5 @@ def project(
     """
     names = [model.camera(i).name for i in range(model.ncam)]
     number = names.index(require_choice("camera", camera, names))
-    return project_points(
-        points,
-        data.cam_xpos[number],
-        data.cam_xmat[number].reshape(3, 3),
-        model.cam_fovy[number],
-        *image_size,
-    )
+    position, orientation = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
+    return project_points(points, position, orientation, model.cam_fovy[number], *image_size)

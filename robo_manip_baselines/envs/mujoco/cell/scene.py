@@ -6,8 +6,9 @@ needs a head, a cube or anything else adds it to the spec before compiling.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -92,17 +93,17 @@ def attach_arm(spec: mujoco.MjSpec, arm: str) -> None:
     spec.attach(arm_spec(), prefix=f"{arm}/", frame=frame)
 
 
-def add_cube(spec: mujoco.MjSpec, name: str = "cube") -> mujoco.MjsBody:
-    """Add the red cube, lying free on the table at (0.1, 0.5): body, free joint and geom ``name``.
+def add_cube(spec: mujoco.MjSpec) -> mujoco.MjsBody:
+    """Add the red cube, lying free on the table at (0.1, 0.5): body, free joint and geom ``cube``.
 
     Its contact bits let it touch robots, the table and the inside of a mouth, not the outside of
     a face.
     """
     half = CUBE_SIZE / 2
-    body = spec.worldbody.add_body(name=name, pos=(0.1, BASE_Y, half))
-    body.add_freejoint(name=name)
+    body = spec.worldbody.add_body(name="cube", pos=(0.1, BASE_Y, half))
+    body.add_freejoint(name="cube")
     body.add_geom(
-        name=name,
+        name="cube",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=(half, half, half),
         mass=CUBE_MASS,
@@ -150,15 +151,11 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     # Newton on dense matrices: some thirty degrees of freedom are too few for sparsity to pay.
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.iterations = 100
-    option.tolerance = 1e-8
-    option.ls_iterations = 50
-    option.ls_tolerance = 0.01
+    option.iterations, option.tolerance = 100, 1e-8
+    option.ls_iterations, option.ls_tolerance = 50, 0.01
     option.noslip_iterations = 0
-    option.ccd_iterations = 35
-    option.ccd_tolerance = 1e-6
-    option.disableflags = 0
-    option.enableflags = 0
+    option.ccd_iterations, option.ccd_tolerance = 35, 1e-6
+    option.disableflags = option.enableflags = 0
     # Boxes, capsules and spheres have colliders of their own. The rest (cylinders, ellipsoids)
     # goes through the native convex collider, with one contact point a pair: releases have
     # changed both defaults.
@@ -174,16 +171,12 @@ def _set_visual(spec: mujoco.MjSpec) -> None:
     """Keep drawing cheap: plain lights, coarse cylinders, buffers no larger than a video needs."""
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = 1280, 960
-    visual.quality.offsamples = 0
-    visual.quality.shadowsize = 1024
-    visual.quality.numslices = 16
-    visual.quality.numstacks = 4
-    visual.quality.numquads = 1
-    visual.headlight.ambient[:] = (0.38, 0.38, 0.38)
-    visual.headlight.diffuse[:] = (0.30, 0.30, 0.30)
-    visual.headlight.specular[:] = (0.0, 0.0, 0.0)
-    visual.map.znear = 0.01  # times the scene's extent
-    visual.map.zfar = 8.0
+    quality = visual.quality
+    quality.offsamples, quality.shadowsize = 0, 1024
+    quality.numslices, quality.numstacks, quality.numquads = 16, 4, 1
+    light = visual.headlight
+    light.ambient[:], light.diffuse[:], light.specular[:] = (0.38,) * 3, (0.30,) * 3, (0.0,) * 3
+    visual.map.znear, visual.map.zfar = 0.01, 8.0  # times the scene's extent
     spec.stat.center[:] = (0.0, BASE_Y, 0.2)
     spec.stat.extent = 1.0
 
@@ -207,17 +200,12 @@ def _add_room(spec: mujoco.MjSpec) -> None:
         conaffinity=SOLID,
         friction=(0.8, 0.005, 0.0001),
     )
+    untouchable: dict[str, Any] = {"contype": 0, "conaffinity": 0}
     leg = (_TABLE_HEIGHT - 2 * thickness) / 2
-    for side in (-1, 1):
-        for end in (-1, 1):
-            world.add_geom(
-                type=box,
-                size=(0.025, 0.025, leg),
-                pos=(side * (width - 0.05), BASE_Y + end * (depth - 0.05), -2 * thickness - leg),
-                material="table_frame",
-                contype=0,
-                conaffinity=0,
-            )
+    for side, end in itertools.product((-1, 1), repeat=2):
+        foot = (side * (width - 0.05), BASE_Y + end * (depth - 0.05), -2 * thickness - leg)
+        size = (0.025, 0.025, leg)
+        world.add_geom(type=box, size=size, pos=foot, material="table_frame", **untouchable)
     # A floor and three walls: all that is seen behind the table.
     for name, size, position in (
         ("floor", (3.0, 3.0, 0.01), (0, BASE_Y, -_TABLE_HEIGHT - 0.01)),
@@ -225,21 +213,14 @@ def _add_room(spec: mujoco.MjSpec) -> None:
         ("wall_left", (0.01, 3.0, 3.0), (-3.0, BASE_Y, 3.0 - _TABLE_HEIGHT)),
         ("wall_right", (0.01, 3.0, 3.0), (3.0, BASE_Y, 3.0 - _TABLE_HEIGHT)),
     ):
+        material = name.partition("_")[0]
         world.add_geom(
-            name=name,
-            type=box,
-            size=size,
-            pos=position,
-            material="floor" if name == "floor" else "wall",
-            contype=0,
-            conaffinity=0,
+            name=name, type=box, size=size, pos=position, material=material, **untouchable
         )
     # A key light from the front right, above, and a weak one opposite, to give shape to the side
     # that the key light leaves dark. A directional light's position is the centre of its shadows.
-    for direction, diffuse, shadow in (
-        ((-0.35, 0.5, -0.8), 0.5, True),
-        ((0.6, 0.3, -0.5), 0.2, False),
-    ):
+    lights = ((-0.35, 0.5, -0.8), 0.5, True), ((0.6, 0.3, -0.5), 0.2, False)
+    for direction, diffuse, shadow in lights:
         world.add_light(
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
             pos=(np.array([0, BASE_Y, 0.2]) - 2.0 * np.array(direction)).tolist(),
@@ -256,6 +237,5 @@ def _add_room(spec: mujoco.MjSpec) -> None:
         ("angle", (0.60, -0.35, 0.72), (0.10, BASE_Y, 0.18), 45.0),
         ("front_close", (0.481, BASE_Y - 0.301, 0.229), MOUTH_BASE, FRONT_CLOSE_FOVY),
     ):
-        world.add_camera(
-            name=name, pos=position, quat=look_at(position, target).tolist(), fovy=fovy
-        )
+        quat = look_at(position, target).tolist()
+        world.add_camera(name=name, pos=position, quat=quat, fovy=fovy)

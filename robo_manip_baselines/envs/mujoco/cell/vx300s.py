@@ -5,7 +5,6 @@ The model is ``assets/vx300s.xml``; ``docs/robot.md`` says where its figures com
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Final
 
@@ -14,27 +13,11 @@ import mujoco
 HOME_QPOS: Final = (0.0, -0.96, 1.16, 0.0, -0.3, 0.0)
 """Home pose of `ARM_JOINTS`, radians (that of the public ALOHA simulation)."""
 
-_FULL_TURN: Final = math.pi - 0.00001
-"""The published limit of the joints that turn all the way round, radians."""
-
-JOINT_LIMITS: Final[dict[str, tuple[float, float]]] = {
-    "waist": (-_FULL_TURN, _FULL_TURN),
-    "shoulder": (math.radians(-106), math.radians(72)),
-    "elbow": (math.radians(-101), math.radians(92)),
-    "forearm_roll": (-_FULL_TURN, _FULL_TURN),
-    "wrist_angle": (math.radians(-107), math.radians(128)),
-    "wrist_rotate": (-_FULL_TURN, _FULL_TURN),
-}
-"""Published limits of `ARM_JOINTS`, radians."""
-
 FINGER_CLOSED: Final = 0.021
 """Position of a finger when the pads meet, metres (published lower limit)."""
 
 FINGER_OPEN: Final = 0.057
 """Position of a finger when the pads are 72 mm apart, metres (published upper limit)."""
-
-
-_MODEL: Final = Path(__file__).with_name("assets") / "vx300s.xml"
 
 
 def arm_spec() -> mujoco.MjSpec:
@@ -45,4 +28,4 @@ def arm_spec() -> mujoco.MjSpec:
     finger's position in metres, `FINGER_CLOSED` … `FINGER_OPEN`), its site ``gripper`` lies
     between the pads with x pointing out of the gripper.
     """
-    return mujoco.MjSpec.from_file(str(_MODEL))
+    return mujoco.MjSpec.from_file(str(Path(__file__).with_name("assets") / "vx300s.xml"))

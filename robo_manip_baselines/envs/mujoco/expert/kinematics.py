@@ -37,36 +37,25 @@ class ArmKinematics:
         )
         self._limits = [mink.ConfigurationLimit(model)]
         self._frame = f"{arm}/gripper"
-        self._qpos = np.array(
-            [int(model.joint(f"{arm}/{joint}").qposadr[0]) for joint in ARM_JOINTS]
-        )
+        self._qpos = np.array([model.joint(f"{arm}/{j}").qposadr[0] for j in ARM_JOINTS])
 
     def forward(self, joints: NDArray[np.float64]) -> mink.SE3:
-        """Return the pose of the gripper.
-
-        Args:
-            joints: (6,) rad.
-        """
+        """Return the pose of the gripper at joint angles (6,) rad."""
         self._set(joints)
         return self._configuration.get_transform_frame_to_world(self._frame, "site")
 
     def inverse(self, target: mink.SE3, start: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the joints near ``start`` that bring the gripper nearest to ``target``.
+        """Return the joints near ``start`` (6,) rad that bring the gripper nearest to ``target``.
 
-        A target out of reach gives the nearest pose that the iterations find within the limits.
-
-        Args:
-            target: pose of the gripper, world frame.
-            start: (6,) rad.
+        The target is in the world frame; one out of reach gives the nearest pose that the
+        iterations find within the limits.
         """
         self._set(start)
         self._task.set_target(target)
         for _ in range(MAX_ITERATIONS):
             error = self._task.compute_error(self._configuration)
-            if (
-                np.linalg.norm(error[:3]) < POSITION_TOLERANCE
-                and np.linalg.norm(error[3:]) < ORIENTATION_TOLERANCE
-            ):
+            away, turned = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+            if away < POSITION_TOLERANCE and turned < ORIENTATION_TOLERANCE:
                 break
             velocity = mink.solve_ik(
                 self._configuration, [self._task], 1.0, solver="daqp", limits=self._limits

@@ -20,24 +20,18 @@ from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.expert.kinematics import ArmKinematics
 from robo_manip_baselines.observation import FRAME_PERIOD
 
-RIGHT_BASE = np.array(ARM_BASES["right"][0])
-"""m, world: the base of the arm that feeds."""
-
 DOWN = mink.SO3.from_z_radians(np.pi) @ mink.SO3.from_y_radians(np.pi / 2)
 """Gripper pointing straight down, its fingers closing along world y."""
 
 
 def level_at(position: NDArray[np.float64]) -> mink.SO3:
-    """Return the orientation of a level gripper at ``position``, pointing away from the arm's base.
+    """Orientation of a level gripper at ``position`` (3,) m, world, pointing away from its base.
 
     Straight in front of the base this is along world -x, into the mouth of a face that looks along
     +x. Elsewhere it turns with the arm: to keep pointing along -x there, the wrist would have to
     work around its singularity, where forearm and gripper are in line.
-
-    Args:
-        position: (3,) m, world.
     """
-    away = position - RIGHT_BASE
+    away = position - np.array(ARM_BASES["right"][0])
     return mink.SO3.from_z_radians(float(np.arctan2(away[1], away[0])))
 
 
@@ -182,8 +176,7 @@ class Approach:
     def step(self, view: ExpertView) -> Command:
         """Move by velocity times control period."""
         # Below one control period, the step would go past the target.
-        elapsed = view.elapsed or 0.0
-        left = max(self._limit - elapsed, CONTROL_PERIOD)
+        left = max(self._limit - (view.elapsed or 0.0), CONTROL_PERIOD)
         velocity = (view.target(self._lead) - self._command.position) / left
         position = self._command.position + velocity * CONTROL_PERIOD
         self._command = replace(self._command, position=position, orientation=level_at(position))
@@ -281,8 +274,7 @@ class PhasedExpert:
             self._phase = self._phases.pop(0)
             self._phase.start(view, self._command)
         self._command = self._phase.step(view)
-        target = mink.SE3.from_rotation_and_translation(
-            self._command.orientation, self._command.position
-        )
+        pose = (self._command.orientation, self._command.position)
+        target = mink.SE3.from_rotation_and_translation(*pose)
         self._joints = self._kinematics.inverse(target, self._joints)
         return np.append(self._joints, self._command.finger).astype(np.float32)

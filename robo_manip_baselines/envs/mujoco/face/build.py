@@ -6,10 +6,11 @@ colours in `texture`, what can be touched in `collision`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
+import cv2
 import mujoco
 import numpy as np
 
@@ -20,7 +21,6 @@ from robo_manip_baselines.envs.mujoco.face.mesh import (
     SKIN,
     Floats,
     Surface,
-    encode_png,
     paint,
     texture_coordinates,
 )
@@ -34,20 +34,10 @@ from robo_manip_baselines.envs.mujoco.face.model import (
 BODIES: Final = ("face/head", "face/jaw", "face/mouth", "face/torso")
 """Mocap bodies, children of the world: the keys of `FaceModel.body_poses`."""
 
-_TEXTURE_FILE: Final = "face_texture.png"
+_BOX, _ELLIPSOID = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID
 
 _EYE_RADIUS: Final = 0.0122
-_IRIS_RADIUS: Final = 0.0064
-_PUPIL_RADIUS: Final = 0.0034
-_EAR_ANGLE: Final = 0.35
-"""Ears stand off the head by this much, radians."""
-_SHIRT: Final = (0.23, 0.42, 0.60, 1.0)
-_LINING: Final = (0.14, 0.035, 0.04, 1.0)
-_TONGUE: Final = (0.46, 0.19, 0.20, 1.0)
 _TEETH: Final = (0.88, 0.85, 0.78, 1.0)
-_SCLERA: Final = (0.96, 0.95, 0.94, 1.0)
-_IRIS: Final = (0.30, 0.19, 0.11, 1.0)
-_PUPIL: Final = (0.03, 0.02, 0.02, 1.0)
 
 _VISUAL: Final[dict[str, Any]] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 1}
 
@@ -73,7 +63,7 @@ def add_face(spec: mujoco.MjSpec) -> None:
     _add_ears(body["head"])
     _add_mouth_parts(spec, body["head"], body["jaw"], model)
     _add_mesh(spec, body["head"], "hair", mesh.hair(model), _colour(HAIR))
-    _add_mesh(spec, body["torso"], "shirt", mesh.bust(), _SHIRT)
+    _add_mesh(spec, body["torso"], "shirt", mesh.bust(), (0.23, 0.42, 0.60, 1.0))
     add_collision(spec, body, model)
 
 
@@ -83,11 +73,14 @@ def _colour(rgb: tuple[int, int, int]) -> tuple[float, float, float, float]:
 
 def _add_materials(spec: mujoco.MjSpec) -> None:
     # Given as an in-memory file, not as a buffer, so that the cell can still be saved as XML.
-    spec.assets = {**spec.assets, _TEXTURE_FILE: encode_png(paint())}
-    spec.add_texture(name="face", type=mujoco.mjtTexture.mjTEXTURE_2D, file=_TEXTURE_FILE)
+    file = "face_texture.png"
+    png = cv2.imencode(".png", cv2.cvtColor(paint(), cv2.COLOR_RGB2BGR))[1].tobytes()
+    spec.assets = {**spec.assets, file: png}
+    spec.add_texture(name="face", type=mujoco.mjtTexture.mjTEXTURE_2D, file=file)
     skin = spec.add_material(name="face/skin", specular=0.15, shininess=0.2)
     skin.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "face"
-    spec.add_material(name="face/lining", rgba=_LINING, specular=0.1, shininess=0.3)
+    dark_red = (0.14, 0.035, 0.04, 1.0)
+    spec.add_material(name="face/lining", rgba=dark_red, specular=0.1, shininess=0.3)
 
 
 def _add_skins(spec: mujoco.MjSpec, model: FaceModel) -> None:
@@ -138,27 +131,20 @@ def _add_eyes(head: mujoco.MjsBody, model: FaceModel) -> None:
         lids = model.vertices[model.rings[f"eye_{side}"]]
         centre = lids.mean(axis=0) - [_EYE_RADIUS - 0.0022, 0.0, 0.0]
         for part, radius, forward, rgba in (
-            ("eye", _EYE_RADIUS, 0.0, _SCLERA),
-            ("iris", _IRIS_RADIUS, _EYE_RADIUS - 0.0052, _IRIS),
-            ("pupil", _PUPIL_RADIUS, _EYE_RADIUS - 0.0020, _PUPIL),
+            ("eye", _EYE_RADIUS, 0.0, (0.96, 0.95, 0.94, 1.0)),
+            ("iris", 0.0064, _EYE_RADIUS - 0.0052, (0.30, 0.19, 0.11, 1.0)),
+            ("pupil", 0.0034, _EYE_RADIUS - 0.0020, (0.03, 0.02, 0.02, 1.0)),
         ):
-            head.add_geom(
-                name=f"face/{part}_{side}",
-                type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=(radius, 0, 0),
-                pos=centre + np.array([forward, 0.0, 0.0]),
-                rgba=rgba,
-                **_VISUAL,
-            )
+            name, place = f"face/{part}_{side}", centre + np.array([forward, 0.0, 0.0])
+            head.add_geom(name=name, size=(radius, 0, 0), pos=place, rgba=rgba, **_VISUAL)
 
 
 def _add_ears(head: mujoco.MjsBody) -> None:
-    kind = mujoco.mjtGeom.mjGEOM_ELLIPSOID
     for name, side in (("left", 1), ("right", -1)):
-        half_turn = side * _EAR_ANGLE / 2
+        half_turn = side * 0.35 / 2  # ears stand off the head by 0.35 rad
         head.add_geom(
             name=f"face/ear_{name}",
-            type=kind,
+            type=_ELLIPSOID,
             size=(0.017, 0.006, 0.031),
             pos=(-0.034, side * 0.080, 0.006),
             quat=(np.cos(half_turn), 0.0, 0.0, np.sin(half_turn)),
@@ -177,47 +163,17 @@ def _add_mouth_parts(
     lower = mesh.teeth(foot, 0.008, 0.019, 0.024)
     _add_mesh(spec, head, "teeth_upper", upper, _TEETH)
     _add_mesh(spec, jaw, "teeth_lower", lower, _TEETH)
-    jaw.add_geom(
-        name="face/tongue",
-        type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-        size=(0.026, 0.017, 0.007),
-        pos=lips + np.array([-0.038, 0.0, -0.009]) - model.hinge,
-        rgba=_TONGUE,
-        **_VISUAL,
-    )
+    size, centre = (0.026, 0.017, 0.007), lips + np.array([-0.038, 0.0, -0.009]) - model.hinge
+    red = (0.46, 0.19, 0.20, 1.0)
+    jaw.add_geom(name="face/tongue", type=_ELLIPSOID, size=size, pos=centre, rgba=red, **_VISUAL)
 
 
-_HIDDEN: Final[dict[str, Any]] = {
-    "mass": 0,
-    "group": 3,
-    "conaffinity": 0,
-    "rgba": (0.9, 0.5, 0.2, 0.4),
-}
-_SOFT: Final[dict[str, Any]] = {
-    # Flesh gives way: a finger of the arm sinks in by a millimetre for every newton or two. The
-    # geoms have priority, or the stiff rubber of the finger pads would decide.
-    "priority": 2,
-    "solref": (0.05, 1.0),
-    "solimp": (0.9, 0.9, 0.001, 0.5, 2.0),
-}
-_OUTSIDE: Final[dict[str, Any]] = {
-    **_HIDDEN,
-    **_SOFT,
-    "contype": FACE,
-    "friction": (0.3, 0.005, 0.0001),
-}
-_INSIDE: Final[dict[str, Any]] = {
-    **_HIDDEN,
-    **_SOFT,
-    "contype": MOUTH,
-    "friction": (1.0, 0.01, 0.0001),
-}
-
-_CAVITY_MASS: Final = 0.5
-_CAVITY_INERTIA: Final = 5e-4
-"""kg and kg m²: ten times the cube's, so that the cube does not move the mouth."""
-_CAVITY_LAG: Final = 0.004
-"""Time constant of the weld, s: twice the physics step, the stiffest that is stable."""
+# Flesh gives way: a finger of the arm sinks in by a millimetre for every newton or two. The geoms
+# have priority, or the stiff rubber of the finger pads would decide.
+_SOFT = {"priority": 2, "solref": (0.05, 1.0), "solimp": (0.9, 0.9, 0.001, 0.5, 2.0)}
+_HIDDEN = {"mass": 0, "group": 3, "conaffinity": 0, "rgba": (0.9, 0.5, 0.2, 0.4), **_SOFT}
+_OUTSIDE: dict[str, Any] = {**_HIDDEN, "contype": FACE, "friction": (0.3, 0.005, 0.0001)}
+_INSIDE: dict[str, Any] = {**_HIDDEN, "contype": MOUTH, "friction": (1.0, 0.01, 0.0001)}
 
 _LIP_RADIUS: Final = 0.004
 _UPPER_CHAIN: Final = (78, 80, 82, 312, 310, 308)
@@ -252,25 +208,14 @@ def add_collision(
     fast in the world while the mouth moves away from under it.
     """
     for owner, name, size, centre in _ELLIPSOIDS:
-        body[owner].add_geom(
-            name=f"face/{name}",
-            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-            size=size,
-            pos=centre,
-            **_OUTSIDE,
-        )
+        shape = {"type": _ELLIPSOID, "size": size, "pos": centre, **_OUTSIDE}
+        body[owner].add_geom(name=f"face/{name}", **shape)
     _add_neck_and_bust(body)
     _add_lips(body, model)
     cavity = _add_cavity(spec, body["mouth"])
     for name, size, centre, tilt in _MOUTH_BOXES:
-        cavity.add_geom(
-            name=f"face/{name}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=size,
-            pos=centre,
-            quat=(np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0),
-            **_INSIDE,
-        )
+        quat = (np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0)
+        cavity.add_geom(name=f"face/{name}", type=_BOX, size=size, pos=centre, quat=quat, **_INSIDE)
 
 
 def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
@@ -280,8 +225,8 @@ def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
         pos=mouth.pos.tolist(),
         quat=mouth.quat.tolist(),
         gravcomp=1.0,
-        mass=_CAVITY_MASS,
-        inertia=(_CAVITY_INERTIA,) * 3,
+        mass=0.5,  # kg and kg m²: ten times the cube's, so that the cube does not move the mouth
+        inertia=(5e-4,) * 3,
         explicitinertial=True,
     )
     cavity.add_freejoint(name="face/cavity")
@@ -291,7 +236,10 @@ def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
         objtype=mujoco.mjtObj.mjOBJ_BODY,
         name1=mouth.name,
         name2=cavity.name,
-        solref=(_CAVITY_LAG, 1.0),
+        solref=(
+            0.004,
+            1.0,
+        ),  # time constant, s: twice the physics step, the stiffest that is stable
     )
     # anchor, relative position and orientation, torque scale (explicit: its default has changed)
     weld.data[:11] = (0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1)
@@ -299,28 +247,16 @@ def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
 
 
 def _add_neck_and_bust(body: Mapping[str, mujoco.MjsBody]) -> None:
-    capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-    body["head"].add_geom(
-        name="face/neck",
-        type=capsule,
-        size=(0.052, 0, 0),
-        fromto=(-0.055, 0, -0.03, -0.060, 0, -0.12),
-        **_OUTSIDE,
-    )
-    body["torso"].add_geom(
-        name="face/shoulders",
-        type=capsule,
-        size=(0.085, 0, 0),
-        fromto=(-0.134, -0.125, -0.240, -0.134, 0.125, -0.240),
-        **_OUTSIDE,
-    )
-    body["torso"].add_geom(
-        name="face/chest",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(0.095, 0.195, 0.11),
-        pos=(-0.136, 0, -0.34),
-        **_OUTSIDE,
-    )
+    _add_capsule(body["head"], "neck", 0.052, (-0.055, 0, -0.03, -0.060, 0, -0.12))
+    shoulders = (-0.134, -0.125, -0.240, -0.134, 0.125, -0.240)
+    _add_capsule(body["torso"], "shoulders", 0.085, shoulders)
+    size, centre = (0.095, 0.195, 0.11), (-0.136, 0, -0.34)
+    body["torso"].add_geom(name="face/chest", type=_BOX, size=size, pos=centre, **_OUTSIDE)
+
+
+def _add_capsule(body: mujoco.MjsBody, name: str, radius: float, ends: Sequence[float]) -> None:
+    kind, size = mujoco.mjtGeom.mjGEOM_CAPSULE, (radius, 0, 0)
+    body.add_geom(name=f"face/{name}", type=kind, size=size, fromto=ends, **_OUTSIDE)
 
 
 def _add_lips(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
@@ -332,21 +268,14 @@ def _add_lips(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
     angle = model.jaw_angle(REST_OPENING)
     at = model.deform(angle)
     back = hinge_quaternion(angle) * [1, -1, -1, -1]
-    outer = dict(
-        zip(model.rings["lips_inner"].tolist(), model.rings["lips_outer"].tolist(), strict=True)
-    )
+    rings = model.rings
+    outer = dict(zip(rings["lips_inner"].tolist(), rings["lips_outer"].tolist(), strict=True))
     count = 0
     for owner, chain in (("head", _UPPER_CHAIN), ("jaw", _LOWER_CHAIN)):
         inner = np.array(chain)
         line = 0.5 * (at[inner] + at[[outer[i] for i in chain]]) - [_LIP_RADIUS, 0.0, 0.0]
         if owner == "jaw":
             line = rotate(back, line - model.hinge)
-        for start, end in pairwise(line):
-            body[owner].add_geom(
-                name=f"face/lip_{count}",
-                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-                size=(_LIP_RADIUS, 0, 0),
-                fromto=[*start.tolist(), *end.tolist()],
-                **_OUTSIDE,
-            )
+        for start, end in pairwise(line.tolist()):
+            _add_capsule(body[owner], f"lip_{count}", _LIP_RADIUS, [*start, *end])
             count += 1

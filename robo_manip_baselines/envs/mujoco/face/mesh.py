@@ -6,8 +6,6 @@ of points joined by strips of triangles. Legend: R rings, N points a ring. Lengt
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -53,9 +51,8 @@ def strips(rings: int, points: int, closed: bool = True) -> NDArray[np.int32]:
     first = (np.arange(rings - 1)[:, None] * points + np.arange(span)).ravel()
     second = (np.arange(rings - 1)[:, None] * points + (np.arange(span) + 1) % points).ravel()
     up_first, up_second = first + points, second + points
-    return np.concatenate(
-        [np.stack([first, second, up_second], 1), np.stack([first, up_second, up_first], 1)]
-    ).astype(np.int32)
+    halves = [(first, second, up_second), (first, up_second, up_first)]
+    return np.concatenate([np.stack(half, 1) for half in halves]).astype(np.int32)
 
 
 def loft(rings: Floats, weight: Floats, closed: bool = True) -> Surface:
@@ -66,11 +63,9 @@ def loft(rings: Floats, weight: Floats, closed: bool = True) -> Surface:
 
 def face_oval(model: FaceModel) -> NDArray[np.int64]:
     """The outline of the measured face as an ordered ring, counter-clockwise from the front."""
-    edges = {}
-    for a, b, c in model.triangles.tolist():
-        for start, end in ((a, b), (b, c), (c, a)):
-            edges[start, end] = (end, start)
-    border = {a: b for (a, b), back in edges.items() if back not in edges}
+    triangles = model.triangles.tolist()
+    edges = {edge: None for a, b, c in triangles for edge in ((a, b), (b, c), (c, a))}
+    border = {a: b for a, b in edges if (b, a) not in edges}
     ring = [int(np.argmax(model.vertices[:, 2]))]
     while border[ring[-1]] != ring[0]:
         ring.append(border[ring[-1]])
@@ -86,14 +81,8 @@ def _skull_rings(start: Floats, steps: Floats, swell: Floats) -> Floats:
     around = np.arctan2(start[:, 1] - SKULL_CENTRE[1], start[:, 2] - SKULL_CENTRE[2])
     first = np.arccos(np.clip((start[:, 0] - SKULL_CENTRE[0]) / SKULL_RADII[0], -1.0, 1.0))
     latitude = first + (np.pi - first) * steps[:, None]
-    direction = np.stack(
-        [
-            np.cos(latitude),
-            np.sin(latitude) * np.sin(around),
-            np.sin(latitude) * np.cos(around),
-        ],
-        axis=-1,
-    )
+    out, aside = np.cos(latitude), np.sin(latitude)
+    direction = np.stack([out, aside * np.sin(around), aside * np.cos(around)], axis=-1)
     on_skull = SKULL_CENTRE + SKULL_RADII * direction
     gap = (start - on_skull[0]) * ((1 - steps) ** 2)[:, None, None]
     return on_skull + gap + swell[..., None] * direction
@@ -125,9 +114,8 @@ def hair(model: FaceModel) -> Surface:
     steps = np.linspace(0.0, 1.0, 14)
     around = np.abs(np.arctan2(start[:, 1], start[:, 2] - SKULL_CENTRE[2]))  # 0 up, pi down
     # where hair begins: at the outline on top, behind the ear at the side, low at the nape
-    hairline = np.interp(
-        around, np.deg2rad([0, 45, 80, 105, 140, 180]), [0, 0, 0.1, 0.42, 0.62, 0.66]
-    )
+    angles = np.deg2rad([0, 45, 80, 105, 140, 180])
+    hairline = np.interp(around, angles, [0, 0, 0.1, 0.42, 0.62, 0.66])
     depth = steps[:, None] - hairline
     swell = HAIR_THICKNESS * np.clip(depth / 0.12, -0.8, 1.0)
     rings = _skull_rings(start, steps, swell)
@@ -202,18 +190,11 @@ def bust() -> Surface:
     angle = np.linspace(0.0, 2 * np.pi, 32, endpoint=False)
     height, depth, width, x, power = (column[:, None] for column in profile.T)
     cosine, sine = np.cos(angle), np.sin(angle)
-    rings = np.stack(
-        [
-            x + depth * np.sign(cosine) * np.abs(cosine) ** (2 / power),
-            width * np.sign(sine) * np.abs(sine) ** (2 / power),
-            np.repeat(height, 32, axis=1),
-        ],
-        axis=-1,
-    )
+    out = x + depth * np.sign(cosine) * np.abs(cosine) ** (2 / power)
+    across = width * np.sign(sine) * np.abs(sine) ** (2 / power)
+    rings = np.stack([out, across, np.repeat(height, 32, axis=1)], axis=-1)
     return loft(rings[:, ::-1], np.zeros(rings.shape[:2]))
 
-
-Floats = NDArray[np.float64]
 
 WIDTH, HEIGHT = 512, 256
 """Pixels: about 1.2 mm each on the face, as fine as a 640x480 image from half a metre."""
@@ -259,18 +240,11 @@ def texture_coordinates(points: Floats) -> Floats:
     return np.stack([0.5 + azimuth / (2 * np.pi), 1 - np.clip(height, 0.0, 1.0)], axis=-1)
 
 
-def _wall(points: Floats) -> Floats:
-    """Metres (..., 2) on the unrolled wall of points (..., 3) in the body frame."""
-    azimuth = np.arctan2(points[..., 1], points[..., 0] - AXIS_X)
-    return np.stack([azimuth * WALL_RADIUS, points[..., 2]], axis=-1)
-
-
 class _Canvas:
     """An image on the wall; every stroke blends a colour in with a soft mask."""
 
     def __init__(self) -> None:
-        self.image = np.empty((HEIGHT, WIDTH, 3))
-        self.image[:] = SKIN
+        self.image = np.full((HEIGHT, WIDTH, 3), SKIN, float)
         azimuth = ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5) * 2 * np.pi
         height = TOP - (np.arange(HEIGHT) + 0.5) / HEIGHT * (TOP - BOTTOM)
         self.grid = np.stack(np.meshgrid(azimuth * WALL_RADIUS, height), axis=-1)
@@ -323,7 +297,8 @@ def _inside(grid: Floats, ring: Floats) -> NDArray[np.bool_]:
 def paint() -> NDArray[np.uint8]:
     """The texture, (`HEIGHT`, `WIDTH`, 3) uint8 RGB, top row first."""
     model = FaceModel.load()
-    at = _wall(model.vertices)
+    x, y, z = model.vertices.T
+    at = np.stack([np.arctan2(y, x - AXIS_X) * WALL_RADIUS, z], axis=-1)  # (V, 2) m, on the wall
     canvas = _Canvas()
     for cheek in _CHEEKS:
         canvas.spot(BLUSH, at[cheek] + [0.0, -0.006], (0.017, 0.014), 0.5)
@@ -332,13 +307,12 @@ def paint() -> NDArray[np.uint8]:
     canvas.spot(SHADE, at[17] - [0.0, 0.008], (0.014, 0.003), 0.30)
     for side in (0, 1):
         lid, crease = list(_UPPER_LASHES[side]), list(_CREASES[side])
+        lower = list(_LOWER_LASHES[side])
         canvas.spot(SHADE, at[crease].mean(axis=0), (0.016, 0.006), 0.25)
-        canvas.spot(
-            SHADE, at[list(_LOWER_LASHES[side])].mean(axis=0) - [0, 0.004], (0.012, 0.004), 0.2
-        )
+        canvas.spot(SHADE, at[lower].mean(axis=0) - [0, 0.004], (0.012, 0.004), 0.2)
         canvas.stroke(SHADE, at[crease], 0.0003, 0.55)
         canvas.stroke(DARK, at[lid], 0.0010, 0.95)
-        canvas.stroke(SHADE, at[list(_LOWER_LASHES[side])], 0.0002, 0.6)
+        canvas.stroke(SHADE, at[lower], 0.0002, 0.6)
         canvas.patch(HAIR, at[list(_BROWS[side])], 0.004, 0.9)
         for nostril in _NOSTRILS[side]:
             canvas.spot(DARK, at[list(nostril)].mean(axis=0), (0.0022, 0.0016), 0.55)
@@ -348,17 +322,3 @@ def paint() -> NDArray[np.uint8]:
     for corner in _LIP_CORNERS:
         canvas.spot(LIP_LINE, at[corner], (0.002, 0.002), 0.5)
     return np.clip(canvas.image + 0.5, 0, 255).astype(np.uint8)
-
-
-def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """A PNG file of an (H, W, 3) RGB image: what MuJoCo reads textures from."""
-    height, width = image.shape[:2]
-    rows = b"".join(b"\0" + row.tobytes() for row in image)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        body = kind + data
-        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows, 6)), chunk(b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)

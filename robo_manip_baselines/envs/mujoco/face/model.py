@@ -67,9 +67,8 @@ class FaceModel:
             # opened here: np.load leaves a file that it finds damaged open
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 if str(file["schema"]) != SCHEMA or int(file["version"]) != VERSION:
-                    raise RequestError(
-                        f"{path}: not a {SCHEMA} file of version {VERSION}; {remedy}"
-                    )
+                    kind = f"{SCHEMA} file of version {VERSION}"
+                    raise RequestError(f"{path}: not a {kind}; {remedy}")
                 return cls(
                     vertices=file["vertices"].astype(float)[:, _TO_BODY],
                     triangles=file["triangles"].astype(np.int32),
@@ -114,9 +113,8 @@ class FaceModel:
         # signed, so that lips which touch or overlap by a hair do not fold the table
         axis = pair[-1, 0] - pair[-1, 1]
         distance = (pair[:, 0] - pair[:, 1]) @ axis / np.linalg.norm(axis)
-        distance = np.where(
-            distance > 2e-3, np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1), distance
-        )
+        length = np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1)
+        distance = np.where(distance > 2e-3, length, distance)
         end = int(np.searchsorted(distance, MAX_OPENING))
         return distance[: end + 1], angle[: end + 1]
 

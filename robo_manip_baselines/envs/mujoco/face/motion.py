@@ -60,13 +60,9 @@ class MotionSegment:
     predicted: NDArray[np.float64] | None = None
 
     def prediction_error(self, time: ArrayLike) -> NDArray[np.float64] | None:
-        """Return prediction minus truth, (..., H, 3) m, of the last frame up to ``time``.
+        """Return prediction minus truth, (..., H, 3) m, of the last frame up to ``time`` (...) s.
 
-        Args:
-            time: (...) s since the start of the segment; held at both ends outside it.
-
-        Returns:
-            None in a library without predictions.
+        Held at both ends outside the segment; None in a library without predictions.
         """
         if self.predicted is None:
             return None
@@ -80,13 +76,10 @@ class MotionSegment:
     def at(
         self, time: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Interpolate: linearly in position and jaw, by slerp in orientation.
-
-        Args:
-            time: (...) s since the start of the segment; held at both ends outside it.
+        """Interpolate at ``time`` (...) s since the start; held at both ends outside the segment.
 
         Returns:
-            displacement (..., 3) m, orientation (..., 4) wxyz and jaw (...) m.
+            displacement (..., 3) m, orientation (..., 4) wxyz (by slerp) and jaw (...) m.
         """
         last = len(self.jaw) - 1
         frame = np.clip(np.asarray(time, dtype=np.float64) * self.fps, 0.0, last)
@@ -96,11 +89,8 @@ class MotionSegment:
         slerp = Slerp(knots, Rotation.from_quat(self.orientation, scalar_first=True))
         orientation = slerp(flat).as_quat(scalar_first=True, canonical=True)
         jaw = np.interp(flat, knots, self.jaw)
-        return (
-            displacement.reshape(*frame.shape, 3),
-            orientation.reshape(*frame.shape, 4),
-            jaw.reshape(frame.shape),
-        )
+        shape = frame.shape
+        return displacement.reshape(*shape, 3), orientation.reshape(*shape, 4), jaw.reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -151,9 +141,8 @@ class MotionLibrary:
                 content = {key: archive[key] for key in archive.files}
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise RequestError(
-                f"motion library '{source}' cannot be read ({reason}); {remedy}"
-            ) from error
+            problem = f"motion library '{source}' cannot be read ({reason})"
+            raise RequestError(f"{problem}; {remedy}") from error
         problem = find_problem(content)
         if problem:
             raise RequestError(f"motion library '{source}' is damaged: {problem}; {remedy}")
@@ -171,64 +160,56 @@ class MotionLibrary:
             predicted=content[PREDICTION].astype(np.float64) if PREDICTION in content else None,
         )
 
-    def starts(self, duration: float = SEGMENT_DURATION) -> NDArray[np.int64]:
-        """Return, (R,), how many frames of each run can start a segment of ``duration`` s."""
-        return np.maximum(self.run_length - math.ceil(duration * self.fps), 0)
+    def starts(self) -> NDArray[np.int64]:
+        """Return, (R,), how many frames of each run can start a segment of `SEGMENT_DURATION`."""
+        return np.maximum(self.run_length - math.ceil(SEGMENT_DURATION * self.fps), 0)
 
-    def draw(
-        self,
-        rng: np.random.Generator,
-        *,
-        clips: Sequence[str] | None = None,
-        duration: float = SEGMENT_DURATION,
-    ) -> MotionSegment:
+    def draw(self, rng: np.random.Generator, clips: Sequence[str] | None = None) -> MotionSegment:
         """Draw a segment whose start is uniform over all frames that can start one.
 
         Args:
             rng: the only source of chance.
             clips: ids of the clips to draw from; all if None.
-            duration: s.
 
         Raises:
             RequestError: no such clip, or no run is long enough.
         """
-        counts = self.starts(duration)
+        counts = self.starts()
         if clips is not None:
             wanted = {require_choice("clip", clip, self.run_clip) for clip in clips}
             counts = np.where([clip in wanted for clip in self.run_clip], counts, 0)
         total = int(counts.sum())
         if total == 0:
-            raise RequestError(
-                f"no run of '{self.source.name}' lasts {duration:g} s"
-                f"{' in clips ' + ', '.join(clips) if clips else ''}; choose other clips"
-            )
+            where = f" in clips {', '.join(clips)}" if clips else ""
+            lacking = f"no run of '{self.source.name}' lasts {SEGMENT_DURATION:g} s{where}"
+            raise RequestError(f"{lacking}; choose other clips")
         index = int(rng.integers(total))
         run = int(np.searchsorted(np.cumsum(counts), index, side="right"))
-        return self.segment(run, index - int(counts[:run].sum()), duration=duration)
+        return self.segment(run, index - int(counts[:run].sum()))
 
-    def segment(self, run: int, start: int, *, duration: float = SEGMENT_DURATION) -> MotionSegment:
-        """Cut a segment from frame ``start`` of a run.
+    def segment(self, run: int, start: int) -> MotionSegment:
+        """Cut a segment of `SEGMENT_DURATION` from frame ``start`` of a run.
 
         It is followed by the frames of the longest prediction horizon where the run has them,
         so that the truth about the future exists until the end of the episode.
         """
         begin = int(self.run_start[run]) + start
         run_end = int(self.run_start[run] + self.run_length[run])
-        end = min(begin + math.ceil(duration * self.fps) + 1 + MAX_HORIZON, run_end)
-        moved = self.mouth[begin:end] - self.mouth[begin]
-        predicted = None
-        if self.predicted is not None:
-            predicted = (self.predicted[begin:end] - self.mouth[begin]) @ WORLD_FROM_CAMERA.T
+        end = min(begin + math.ceil(SEGMENT_DURATION * self.fps) + 1 + MAX_HORIZON, run_end)
+
+        def moved(mouth: NDArray[np.float64]) -> NDArray[np.float64]:
+            return (mouth[begin:end] - self.mouth[begin]) @ WORLD_FROM_CAMERA.T
+
         return MotionSegment(
             fps=self.fps,
-            displacement=moved @ WORLD_FROM_CAMERA.T,
+            displacement=moved(self.mouth),
             orientation=self.orientation[begin:end],
             jaw=self.jaw[begin:end],
             clip=self.run_clip[run],
             subject=self.run_subject[run],
             start=start,
             index=begin,
-            predicted=predicted,
+            predicted=None if self.predicted is None else moved(self.predicted),
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel
-from robo_manip_baselines.envs.mujoco.face.motion import MotionSegment
+from robo_manip_baselines.envs.mujoco.face.motion import SEGMENT_DURATION, MotionSegment
 from robo_manip_baselines.observation import FRAME_PERIOD, MAX_HORIZON
 
 FACE_MOTIONS = ("episode", "after_lift")
@@ -34,14 +34,12 @@ class FaceReplay:
             between them the predictor's last error is held.
         jaw: (T,) m between the inner lips.
         opening: (T, 2) m, half width and half height of the mouth's opening.
-        substeps: physics steps in a control step.
     """
 
     bodies: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     mouth: NDArray[np.float64]
     jaw: NDArray[np.float64]
     opening: NDArray[np.float64]
-    substeps: int
     predicted: NDArray[np.float64] | None = None
 
     @classmethod
@@ -51,21 +49,19 @@ class FaceReplay:
         start_position: NDArray[np.float64],
         face: FaceModel,
         *,
-        duration: float,
         timestep: float,
         substeps: int,
     ) -> FaceReplay:
-        """Interpolate a segment onto the physics clock.
+        """Interpolate `SEGMENT_DURATION` onto the physics clock; the face stands still afterwards.
 
         Args:
             segment: recorded motion, relative to its start.
             start_position: (3,) m, world: the mouth at the start of the segment.
             face: places the bodies of the face around the mouth.
-            duration: s to lay out; the face stands still afterwards.
             timestep: s of physics.
             substeps: physics steps in a control step.
         """
-        physics = np.arange(round(duration / timestep) + 1) * timestep
+        physics = np.arange(round(SEGMENT_DURATION / timestep) + 1) * timestep
         displacement, orientation, recorded_jaw = segment.at(physics)
         ahead, _, _ = segment.at(physics[::substeps, None] + FRAMES_AHEAD)
         error = segment.prediction_error(physics[::substeps])
@@ -75,14 +71,5 @@ class FaceReplay:
             mouth=start_position + ahead,
             jaw=jaw[::substeps],
             opening=np.stack(face.opening(jaw[::substeps]), axis=-1),
-            substeps=substeps,
             predicted=None if error is None else start_position + ahead[:, 1:] + error,
         )
-
-    def physics_index(self, step: int) -> int:
-        """Row of ``bodies`` at physics step ``step`` of the segment; held at both ends."""
-        return min(max(step, 0), (len(self.jaw) - 1) * self.substeps)
-
-    def control_index(self, step: int) -> int:
-        """Row of the other arrays at control step ``step`` of the segment; held likewise."""
-        return min(max(step, 0), len(self.jaw) - 1)

@@ -16,11 +16,7 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MO
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
 from robo_manip_baselines.envs.mujoco.face.model import rotate
-from robo_manip_baselines.envs.mujoco.face.motion import (
-    SEGMENT_DURATION,
-    MotionLibrary,
-    MotionSegment,
-)
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, MotionSegment
 from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FRAMES_AHEAD, FaceReplay
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry
 from robo_manip_baselines.observation import (
@@ -47,11 +43,8 @@ RENDER_CAMERA = "angle"
 """Camera of ``render()``."""
 
 # Wide enough for whatever physics may do; observations are not clipped to them.
-_BOUNDS = {" position": 2.0 * np.pi, " velocity": 100.0, "t_": 60.0}
-"""rad, m; rad/s, m/s; s."""
-
-_LENGTH_BOUND = 5.0
-"""m, of everything else."""
+_BOUNDS = {" position": 2.0 * np.pi, " velocity": 100.0, "t_": 60.0, "": 5.0}
+"""Bounds of the elements with this in their names: rad, m; rad/s, m/s; s; m, of all the rest."""
 
 
 class FaceEnv(gymnasium.Env[Any, Any]):
@@ -111,14 +104,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         if not isinstance(corruption, Corruption):
             corruption = Corruption.from_json(corruption or {})
+        size = (image_size[0], image_size[1])
         spec = self.observation_spec = ObservationSpec(
-            obs=obs,
-            horizon=horizon,
-            cameras=tuple(cameras),
-            image_size=(image_size[0], image_size[1]),
-            object_pose=object_pose,
-            arms=arms,
-            corruption=corruption,
+            obs, horizon, tuple(cameras), size, object_pose, arms, corruption
         )
         if object_pose and not self.task.names.objects:
             raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")
@@ -134,11 +122,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 )
             if self.library.predicted is None:
                 raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
-        self.clips = (
-            None
-            if clips is None
-            else tuple(require_choice("clip", clip, set(self.library.run_clip)) for clip in clips)
-        )
+        for clip in clips or ():
+            require_choice("clip", clip, set(self.library.run_clip))
+        self.clips = None if clips is None else tuple(clips)
         self.face = FaceModel.load()
         scene = build_cell()
         add_face(scene)
@@ -147,13 +133,13 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.xml_hash = hashlib.sha256(scene.to_xml().encode()).hexdigest()
         self.data = mujoco.MjData(self.model)
         self.substeps = round(CONTROL_PERIOD / self.model.opt.timestep)
-        height, width = spec.image_size
         self.renderer = CameraRenderer(
-            self.model, height, width, shadows=shadows, multisamples=multisamples
+            self.model, *spec.image_size, shadows=shadows, multisamples=multisamples
         )
         self._viewer: Any = None
         self._index_model()
-        self.action_space = self._make_action_space()
+        low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
+        self.action_space = gymnasium.spaces.Box(low, high)
         self.observation_space = make_observation_space(spec, self.task.names)
 
     # -- task -----------------------------------------------------------------------------------
@@ -194,15 +180,13 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     # -- indices --------------------------------------------------------------------------------
 
     def _index_model(self) -> None:
-        model = self.model
-        arms = self.observation_spec.arm_names
+        model, arms = self.model, self.observation_spec.arm_names
         joints = np.array([[model.joint(f"{arm}/{j}").id for j in ARM_JOINTS] for arm in arms])
         fingers = np.array([model.joint(f"{arm}/left_finger").id for arm in arms])
         self._joint_qpos, self._joint_dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._finger_qpos, self._finger_dof = model.jnt_qposadr[fingers], model.jnt_dofadr[fingers]
-        self._actuators = np.array(
-            [[model.actuator(f"{arm}/{j}").id for j in (*ARM_JOINTS, "gripper")] for arm in arms]
-        ).ravel()
+        servos = [f"{arm}/{joint}" for arm in arms for joint in (*ARM_JOINTS, "gripper")]
+        self._actuators = np.array([model.actuator(servo).id for servo in servos])
         self._gripper_site = model.site("right/gripper").id
         self._mouth_site = model.site("mouth").id
         self._mocap = {
@@ -210,10 +194,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             for body in range(model.nbody)
             if model.body_mocapid[body] >= 0
         }
-
-    def _make_action_space(self) -> gymnasium.spaces.Box:
-        low, high = self.model.actuator_ctrlrange[self._actuators].T
-        return gymnasium.spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
     # -- Gymnasium ------------------------------------------------------------------------------
 
@@ -231,7 +211,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             self.segment,
             MOUTH_BASE + self.face_offset,
             self.face,
-            duration=SEGMENT_DURATION,
             timestep=self.model.opt.timestep,
             substeps=self.substeps,
         )
@@ -244,8 +223,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         mujoco.mj_forward(self.model, self.data)
         if self._pipeline:
             # Last, so that the world is the same as without corruption.
-            drawn = int(self.np_random.integers(2**32)) if seed is None else seed
-            self._pipeline.reset(drawn)
+            self._pipeline.reset(int(self.np_random.integers(2**32)) if seed is None else seed)
         self._show()
         return self.observe(), self.info()
 
@@ -269,10 +247,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             ValueError: the action has the wrong shape or is not finite.
         """
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self._actuators.shape or not np.isfinite(action).all():
-            raise ValueError(
-                f"action of shape {action.shape} must be {self._actuators.shape} finite numbers"
-            )
+        shape = self._actuators.shape
+        if action.shape != shape or not np.isfinite(action).all():
+            raise ValueError(f"action of shape {action.shape} must be {shape} finite numbers")
         low, high = self.model.actuator_ctrlrange[self._actuators].T
         self.data.ctrl[self._actuators] = np.clip(action, low, high)
         for substep in range(self.substeps):
@@ -333,16 +310,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return quat
 
     @property
-    def head_orientation(self) -> Floats:
-        """(4,) wxyz, world from head; identity for an upright face that looks along world +x."""
-        return self.data.mocap_quat[self._mocap["face/head"]].copy()
-
-    @property
-    def joint_names(self) -> list[str]:
-        """The columns of joint positions and velocities."""
-        return [f"{arm}/{joint}" for arm in self.observation_spec.arm_names for joint in ARM_JOINTS]
-
-    @property
     def action_names(self) -> list[str]:
         """The elements of an action."""
         return [self.model.actuator(actuator).name for actuator in self._actuators]
@@ -350,7 +317,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     @property
     def mouth_track(self) -> Floats:
         """(K, 3) m, world: the true mouth now and 1 ... 5 frames ahead."""
-        return self.replay.mouth[self.replay.control_index(self._motion_step())].copy()
+        return self.replay.mouth[self._row()].copy()
 
     @property
     def predicted_mouth(self) -> Floats | None:
@@ -359,19 +326,14 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         None if the motion library holds no predictions.
         """
         predicted = self.replay.predicted
-        index = self.replay.control_index(self._motion_step())
-        return None if predicted is None else predicted[index].copy()
+        return None if predicted is None else predicted[self._row()].copy()
 
     def landmark_track(self, landmark: int) -> Floats:
-        """Return the true position of a point of the face now and 1 ... 5 frames ahead.
+        """(K, 3) m, world: a point of the face now and 1 ... 5 frames ahead.
 
-        Args:
-            landmark: vertex of `FaceModel`, 0 to 467, numbered as MediaPipe does.
-
-        Returns:
-            (K, 3) m, world.
+        Landmarks are vertices of `FaceModel`, 0 to 467, numbered as MediaPipe does.
         """
-        start = self.replay.control_index(self._motion_step()) * CONTROL_PERIOD
+        start = self._row() * CONTROL_PERIOD
         displacement, orientation, jaw = self.segment.at(start + FRAMES_AHEAD)
         mouth, jaw = MOUTH_BASE + self.face_offset + displacement, jaw + REST_OPENING
         head, turn = self.face.body_poses(mouth, orientation, jaw)["face/head"]
@@ -393,12 +355,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     @property
     def jaw_opening(self) -> float:
         """m between the inner lips."""
-        return float(self.replay.jaw[self.replay.control_index(self._motion_step())])
+        return float(self.replay.jaw[self._row()])
 
     @property
     def mouth_opening(self) -> Floats:
         """(2,) m: half width and half height of the opening between the inner lips."""
-        return self.replay.opening[self.replay.control_index(self._motion_step())]
+        return self.replay.opening[self._row()]
 
     def state(self) -> State:
         """Return the state before corruption."""
@@ -443,7 +405,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             "end_effector_orientation": self.gripper_orientation,
             "mouth_position": self.mouth_track,
             **({} if predicted is None else {"predicted_mouth": predicted}),
-            "head_orientation": self.head_orientation,
+            # World from head; identity for an upright face that looks along world +x.
+            "head_orientation": self.data.mocap_quat[self._mocap["face/head"]].copy(),
             "jaw_opening": self.jaw_opening,
             "phase": np.int8(self.phase_names.index(self.info()["phase"])),
             "qpos": self.data.qpos.copy(),
@@ -456,7 +419,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
         A task with attributes of its own extends it.
         """
-        segment = self.segment
+        segment, arms = self.segment, self.observation_spec.arm_names
         return {
             "motion_clip": segment.clip,
             "motion_subject": segment.subject,
@@ -466,7 +429,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             "control_period": CONTROL_PERIOD,
             "prediction_period": FRAME_PERIOD,
             "phase_names": list(self.phase_names),
-            "joint_names": self.joint_names,
+            "joint_names": [f"{arm}/{joint}" for arm in arms for joint in ARM_JOINTS],
             "action_names": self.action_names,
             "xml_hash": self.xml_hash,
         }
@@ -475,9 +438,14 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         """Control steps since the recorded motion started; 0 while it waits."""
         return 0 if self.motion_start is None else self.step_count - self.motion_start
 
+    def _row(self) -> int:
+        """Row of the replay's arrays at the present step; held at the end of the recording."""
+        return min(self._motion_step(), len(self.replay.jaw) - 1)
+
     def _place_face(self, substep: int) -> None:
         moving = 0 if self.motion_start is None else substep
-        row = self.replay.physics_index(self._motion_step() * self.substeps + moving)
+        last = (len(self.replay.jaw) - 1) * self.substeps
+        row = min(self._motion_step() * self.substeps + moving, last)
         for body, (position, orientation) in self.replay.bodies.items():
             self.data.mocap_pos[self._mocap[body]] = position[row]
             self.data.mocap_quat[self._mocap[body]] = orientation[row]
@@ -501,14 +469,9 @@ def make_observation_space(spec: ObservationSpec, names: ObservedNames) -> gymna
     """Return a ``Dict`` of float32 vectors, and of uint8 images of shape (height, width, 3)."""
     spaces: dict[str, gymnasium.Space[Any]] = {}
     for key, elements in spec.components(names).items():
-        high = np.array([_bound(name) for name in elements], dtype=np.float32)
+        bounds = [[bound for part, bound in _BOUNDS.items() if part in name] for name in elements]
+        high = np.array([bound[0] for bound in bounds], dtype=np.float32)
         spaces[key] = gymnasium.spaces.Box(-high, high)
     for key in spec.image_keys():
         spaces[key] = gymnasium.spaces.Box(0, 255, (*spec.image_size, 3), np.uint8)
     return gymnasium.spaces.Dict(spaces)
-
-
-def _bound(name: str) -> float:
-    """Return a generous bound of an observed quantity, in its unit."""
-    matches = [bound for part, bound in _BOUNDS.items() if part in name]
-    return matches[0] if matches else _LENGTH_BOUND

@@ -21,16 +21,9 @@ from robo_manip_baselines.observation import ObservedNames
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 NAMESPACE = "robo_manip_baselines"
-ENTRY_POINTS = "robo_manip_baselines.tasks"
 
-TASKS = {
-    "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
-}
+TASKS = {"FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY"}
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
-
-Size = int | str
-AttributeKind = Literal["text", "json", "int", "float", "bool", "vector"]
-Rule = Literal["", "unit quaternion", "increasing", "not negative", "phase index"]
 
 
 @dataclass(frozen=True)
@@ -40,22 +33,22 @@ class Field:
     Attributes:
         name: in the file.
         shape: sizes, or symbols of the episode format, from "T" on.
-        dtype: of the array.
+        description: for the documentation.
         unit: SI unit of the elements.
         frame: in which they are expressed.
-        description: for the documentation.
+        dtype: of the array.
         rule: that the numbers obey.
         since: schema version; absent from files of a lower one.
         is_optional: whether an episode may come without.
     """
 
     name: str
-    shape: tuple[Size, ...]
-    dtype: str
-    unit: str
-    frame: str
+    shape: tuple[int | str, ...]
     description: str
-    rule: Rule = ""
+    unit: str = ""
+    frame: str = ""
+    dtype: str = "float64"
+    rule: Literal["", "unit quaternion", "increasing", "not negative", "phase index"] = ""
     since: int = 1
     is_optional: bool = False
 
@@ -73,7 +66,7 @@ class Attribute:
     """
 
     name: str
-    kind: AttributeKind
+    kind: Literal["text", "json", "int", "float", "bool", "vector"]
     description: str
     is_derived: bool = False
     length: int = 0
@@ -285,8 +278,8 @@ def load_part(reference: str) -> Any:
 @cache
 def _references() -> dict[str, str]:
     """Map the names of all tasks to ``module:name``, the package's own first."""
-    others = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
-    return {**others, **TASKS}
+    points = entry_points(group="robo_manip_baselines.tasks")
+    return {point.name: point.value for point in points} | TASKS
 
 
 def task_names() -> list[str]:
@@ -300,7 +293,7 @@ def task_entry(name: str) -> TaskEntry:
     Raises:
         RequestError: there is no such task.
     """
-    references = {**_references(), **TASKS}
+    references = _references() | TASKS
     return load_part(references[require_choice("environment", name, references)])
 
 
@@ -322,9 +315,8 @@ def register_envs(names: Sequence[str] | None = None) -> None:
     for name in task_names() if names is None else names:
         entry = task_entry(name)
         if entry.env_id not in gymnasium.registry:
-            gymnasium.register(
-                entry.env_id, entry_point=entry.env, max_episode_steps=entry.max_episode_steps
-            )
+            limit = entry.max_episode_steps
+            gymnasium.register(entry.env_id, entry_point=entry.env, max_episode_steps=limit)
 
 
 def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
@@ -333,48 +325,42 @@ def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     Raises:
         RequestError: there is no such task, or an argument is not valid.
     """
-    entry = task_entry(name)
     register_envs([name])
-    return gymnasium.make(entry.env_id, **kwargs)
+    return gymnasium.make(task_entry(name).env_id, **kwargs)
 
 
 FACE_FIELDS = (
     Field(
         "mouth_position",
         ("T", 6, 3),
-        "float64",
+        "True mouth centre now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
         "m",
         "world",
-        "True mouth centre now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
     ),
     Field(
         "predicted_mouth",
         ("T", 5, 3),
-        "float64",
-        "m",
-        "world",
         "Mouth centre k = 1…5 frames ahead as forecast by a trained predictor, its last error held "
         "between video frames: x, y, z; only where the recorded motion holds predictions",
+        "m",
+        "world",
         since=2,
         is_optional=True,
     ),
     Field(
         "head_orientation",
         ("T", 4),
-        "float64",
+        "True head orientation now: quaternion w, x, y, z",
         "1",
         "world",
-        "True head orientation now: quaternion w, x, y, z",
-        "unit quaternion",
+        rule="unit quaternion",
     ),
     Field(
         "jaw_opening",
         ("T",),
-        "float64",
-        "m",
-        "",
         "Distance between the middle of the inner lips, now",
-        "not negative",
+        "m",
+        rule="not negative",
     ),
 )
 """Fields that every task with a replayed face records."""

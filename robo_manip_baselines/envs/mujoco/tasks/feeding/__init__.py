@@ -43,11 +43,10 @@ ENTRY = TaskEntry(
         Field(
             "object_pose",
             ("T", 7),
-            "float64",
+            "The cube: x, y, z, then quaternion w, x, y, z",
             "m, 1",
             "world",
-            "The cube: x, y, z, then quaternion w, x, y, z",
-            "unit quaternion",
+            rule="unit quaternion",
         ),
     ),
     attributes=(

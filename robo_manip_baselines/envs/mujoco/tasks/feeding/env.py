@@ -147,9 +147,8 @@ class FeedingEnv(FaceEnv):
         self._cube_qpos = int(model.joint("cube").qposadr[0])
         self._cube_body = model.body("cube").id
         self._cube_geom = model.geom("cube").id
-        self._is_finger = np.stack(
-            [_geoms_of(model, f"right/{side}_finger_link") for side in ("left", "right")]
-        )
+        links = [model.body(f"right/{side}_finger_link").id for side in ("left", "right")]
+        self._is_finger = model.geom_bodyid == np.array(links)[:, None]  # (2, ngeom)
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Add the red cube."""
@@ -190,13 +189,12 @@ class FeedingEnv(FaceEnv):
     def advance(self) -> tuple[float, bool]:
         """Evaluate the task after a control step; return reward and whether it has ended."""
         before = self.progress
-        self.progress = before.advance(self._measure())
-        if self.progress.lift_time is not None:
+        self.progress = now = before.advance(self._measure())
+        if now.lift_time is not None:
             self.start_motion()
-        reward = float(self.progress.is_success and not before.is_success) + float(
-            self.progress.is_success_strict and not before.is_success_strict
-        )
-        delivered = self.progress.is_success and self.progress.is_clear
+        reward = float(now.is_success and not before.is_success)
+        reward += float(now.is_success_strict and not before.is_success_strict)
+        delivered = now.is_success and now.is_clear
         return reward, delivered or bool(self.cube_position[2] < OFF_TABLE)
 
     def task_row(self) -> dict[str, Any]:
@@ -246,8 +244,3 @@ class FeedingEnv(FaceEnv):
             touches_face=self._face_force > 0.0,
             gripper_distance=float(np.linalg.norm(gripper - mouth)),
         )
-
-
-def _geoms_of(model: mujoco.MjModel, body: str) -> NDArray[np.bool_]:
-    """Mark the geoms of a body, (ngeom,)."""
-    return model.geom_bodyid == model.body(body).id

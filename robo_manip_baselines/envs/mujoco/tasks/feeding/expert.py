@@ -85,13 +85,9 @@ class FeedingExpert(PhasedExpert):
     def phases(self, home: Command) -> list[ExpertPhase]:
         """Return the phases of one episode, in order."""
 
-        def above(view: ExpertView, last: Command) -> Command:
-            height = np.array([0.0, 0.0, GRASP_OFFSET + CLEARANCE])
-            return Command(view.object_position + height, DOWN, FINGER_OPEN)
-
-        def grasp(view: ExpertView, last: Command) -> Command:
-            height = np.array([0.0, 0.0, GRASP_OFFSET])
-            return Command(view.object_position + height, DOWN, FINGER_OPEN)
+        def over_object(view: ExpertView, height: float) -> Command:
+            position = view.object_position + np.array([0.0, 0.0, height])
+            return Command(position, DOWN, FINGER_OPEN)
 
         def lifted(view: ExpertView, last: Command) -> Command:
             return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
@@ -100,13 +96,10 @@ class FeedingExpert(PhasedExpert):
             position = view.target() + STANDOFF
             return Command(position, level_at(position), last.finger)
 
-        def go_home(view: ExpertView, last: Command) -> Command:
-            return home
-
         return [
             # Phase 1: approach and grasp the cube.
-            Reach(above),
-            Reach(grasp, speed=0.15),
+            Reach(lambda view, last: over_object(view, GRASP_OFFSET + CLEARANCE)),
+            Reach(lambda view, last: over_object(view, GRASP_OFFSET), speed=0.15),
             Grip(FINGER_CLOSED, 0.4),
             Reach(lifted, speed=0.2),
             Reach(standoff, least_duration=1.2),
@@ -116,5 +109,5 @@ class FeedingExpert(PhasedExpert):
             Follow(INSERTION, 0.4, lead=self._lead),
             Follow(INSERTION, 0.3, finger=FINGER_OPEN, lead=self._lead),
             Follow(WITHDRAWAL, 0.6, lead=self._lead, speed=0.3),
-            Reach(go_home),
+            Reach(lambda view, last: home),
         ]

@@ -49,13 +49,8 @@ class FeedingMetrics:
 
     def result(self, info: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         """Return the kind of failure and the columns of the result row."""
-        failure = failure_kind(
-            is_success=bool(info["is_success"]),
-            was_released=info["phase"] == RELEASED,
-            closest_offset=self._offset,
-        )
-        time = info["time_since_lift"]
-        return failure, {
+        time, was_released = info["time_since_lift"], info["phase"] == RELEASED
+        return failure_kind(bool(info["is_success"]), was_released, self._offset), {
             # Times are sums of 0.02 s; microseconds hide what floating point adds to them.
             "time_since_lift": None if time is None else round(float(time), 6),
             "closest_distance": self._distance,
@@ -65,9 +60,7 @@ class FeedingMetrics:
         }
 
 
-def failure_kind(
-    *, is_success: bool, was_released: bool, closest_offset: tuple[float, float, float] | None
-) -> str:
+def failure_kind(is_success: bool, was_released: bool, closest_offset: Offset | None) -> str:
     """Return the kind of failure of an episode; ``""`` for a success.
 
     The closest approach counts. A gripper that has come to the face and is beside the mouth

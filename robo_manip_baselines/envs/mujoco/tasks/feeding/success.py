@@ -37,11 +37,9 @@ class Phase(enum.IntEnum):
 
 
 def is_at_mouth(gripper: NDArray[np.float64], mouth: NDArray[np.float64]) -> bool:
-    """Algorithm 1's spatial condition: within 0.03, 0.01 and 0.01 m, the bounds excluded.
+    """Algorithm 1's spatial condition on two points, (3,) m, in the world frame.
 
-    Args:
-        gripper: (3,) m, world frame.
-        mouth: (3,) m, world frame.
+    They are within 0.03, 0.01 and 0.01 m of one another, the bounds excluded.
     """
     return bool(np.all(np.abs(gripper - mouth) < MOUTH_TOLERANCE))
 
@@ -157,9 +155,15 @@ class FeedingProgress:
         if release_time is None and lifted and not step.is_touched:
             release_time, released_inside = step.time, step.is_inside_mouth
         released = release_time is not None
+        if released:
+            phase = Phase.RELEASE
+        elif lifted:
+            phase = Phase.CARRY if success_time is None else Phase.DELIVER
+        else:
+            phase = Phase.GRASP if step.is_held else Phase.REACH
         return replace(
             self,
-            phase=_phase(step, lifted, success_time is not None, released),
+            phase=phase,
             lift_time=lift_time,
             success_time=success_time,
             release_time=release_time,
@@ -167,13 +171,3 @@ class FeedingProgress:
             released_inside=released_inside,
             is_clear=self.is_clear or (released and step.gripper_distance >= CLEAR_DISTANCE),
         )
-
-
-def _phase(step: StepMeasurements, lifted: bool, succeeded: bool, released: bool) -> Phase:
-    if released:
-        return Phase.RELEASE
-    if succeeded:
-        return Phase.DELIVER
-    if lifted:
-        return Phase.CARRY
-    return Phase.GRASP if step.is_held else Phase.REACH
