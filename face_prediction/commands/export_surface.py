@@ -20,12 +20,7 @@ from face_prediction.motion.library import (
     read_attributions,
     track_files,
 )
-from face_prediction.motion.surface import (
-    facing_out,
-    measure,
-    mediapipe_topology,
-    metric_landmarks,
-)
+from face_prediction.motion.surface import facing_out, measure, mediapipe_topology, metric_landmarks
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.npz import write_npz
