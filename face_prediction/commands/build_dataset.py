@@ -33,6 +33,7 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings, kind_of
 from face_prediction.motion.library import Attribution, read_attributions, track_files
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_folder
 
 logger = logging.getLogger(__name__)
 
@@ -161,8 +162,7 @@ def refuse_other_folder(out: Path) -> None:
     Raises:
         RequestError: it is a file, or holds something else.
     """
-    if out.exists() and not out.is_dir():
-        raise RequestError(f"--out {out}: is a file; name a folder")
+    require_out_folder(out)
     if (out / MANIFEST_NAME).exists():
         try:
             read_manifest(out)

@@ -22,6 +22,7 @@ from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoReader, require_video
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_file
 
 logger = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ def run_live(options: LiveOptions) -> int:
     rate = settings.fps
     if options.video is not None:
         with VideoReader(options.video) as reader:
-            rate = reader.info.average_rate or rate
+            rate = reader.average_rate or rate
     statistics = LiveStatistics()
     code = 0
     with ExitStack() as stack:
@@ -120,8 +121,7 @@ def check_live_options(options: LiveOptions) -> None:
         require_video(video)
     if out is None:
         return
-    if out.is_dir():
-        raise RequestError(f"--out {out}: is a folder; name a file")
+    require_out_file(out)
     if out.suffix.lower() != ".mp4":
         raise RequestError(f"--out {out}: name an .mp4 file")
     if video is not None and out.exists() and out.samefile(video):

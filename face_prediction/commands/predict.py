@@ -15,7 +15,7 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from face_prediction.dataset.build import find_videos, require_same_video, video_of
+from face_prediction.dataset.build import find_videos, source_video
 from face_prediction.dataset.histories import (
     crop_history,
     errors_across,
@@ -121,7 +121,9 @@ def run_predict(options: PredictOptions) -> int:
     short: dict[str, int] = {}
     # the videos are checked before the first is forecast, which may take an hour
     paths = [
-        find_video(clip, videos) if predictor.needs.frames else None
+        source_video(clip.path, load_track(clip.path), videos)[0]
+        if predictor.needs.frames
+        else None
         for clip, predictor in zip(clips, predictors, strict=True)
     ]
     for clip, predictor, video in zip(clips, predictors, paths, strict=True):
@@ -193,18 +195,6 @@ def fold_of(clip: LiftedClip, manifest: Manifest) -> int | None:
                 f"'{entry.subject}' in the dataset; use one name for one person"
             )
     return {entry.subject: entry.fold for entry in manifest.clips}.get(clip.row.subject)
-
-
-def find_video(clip: LiftedClip, videos: dict[str, list[Path]]) -> Path:
-    """The video of a clip.
-
-    Raises:
-        RequestError: it is in no folder, or is not the one that the track was made from.
-    """
-    track = load_track(clip.path)
-    video = video_of(clip.path, track, videos)
-    require_same_video(clip.path, track, video)
-    return video
 
 
 def forecast_clip(

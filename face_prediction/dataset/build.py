@@ -66,11 +66,12 @@ def find_videos(folders: Iterable[Path]) -> dict[str, list[Path]]:
     return found
 
 
-def video_of(path: Path, track: FaceTrack, videos: dict[str, list[Path]]) -> Path:
-    """The video that the track from ``path`` names as its source.
+def source_video(path: Path, track: FaceTrack, videos: dict[str, list[Path]]) -> tuple[Path, str]:
+    """The video that the track from ``path`` was made from, and its SHA-256.
 
     Raises:
-        RequestError: there is none of that name, or several.
+        RequestError: there is none of its name, or several, or it is another one; where the video
+            breaks off, the message says that.
     """
     name = str(track.source.get("name", ""))
     found = videos.get(name, [])
@@ -78,18 +79,10 @@ def video_of(path: Path, track: FaceTrack, videos: dict[str, list[Path]]) -> Pat
         raise RequestError(f"{path}: its video '{name}' is in no folder of --videos")
     if len(found) > 1:
         raise RequestError(f"{path}: {' and '.join(map(str, found))} are both named '{name}'")
-    return found[0]
-
-
-def require_same_video(path: Path, track: FaceTrack, video: Path) -> str:
-    """Check that the track from ``path`` was made from this very video, and return its SHA-256.
-
-    Raises:
-        RequestError: it was not; where the video breaks off, the message says that.
-    """
+    video = found[0]
     digest = file_digest(video)
     if track.source.get("sha256") == digest:
-        return digest
+        return video, digest
     with VideoReader(video) as reader:
         for _ in reader.frames():  # raises where the file breaks off, which explains the hash
             pass
@@ -122,12 +115,12 @@ def build_clip(
             the clip's file is of another kind.
     """
     track = load_track(path)
-    video = video_of(path, track, videos)
+    video, video_sha256 = source_video(path, track, videos)
     record = {
         "clip": path.stem,
         "track_sha256": file_digest(path),
         "video": video.name,
-        "video_sha256": require_same_video(path, track, video),
+        "video_sha256": video_sha256,
         "settings": settings.to_json(),
     }
     target = out / CLIP_FOLDER / f"{path.stem}.h5"

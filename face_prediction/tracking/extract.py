@@ -318,7 +318,7 @@ def extract_track(
     several = 0
     size = (0, 0)
     with VideoReader(path) as video:
-        for frame in with_bar(video.frames(), video.info.expected_frames or None, label):
+        for frame in with_bar(video.frames(), video.expected_frames or None, label):
             height, width = frame.image.shape[:2]
             if times and (width, height) != size:
                 raise RequestError(f"{path}: its image size changes at {frame.time:.2f} s")
@@ -340,24 +340,12 @@ def extract_track(
         "reacquired": follower.reacquired,
         "frames_zoomed": zooming.frames if zooming else 0,
         "zoom_windows": zooming.windows if zooming else 0,
-        "average_rate": video.info.average_rate,
+        "average_rate": video.average_rate,
         # intervals that differ by more than 5 ms; container clocks tick more finely
         "variable_rate": bool(len(steps) > 1 and np.ptp(steps) > 0.005),
     }
     if source["frames_with_face"] == 0:
         raise NoFaceError(f"{path}: no face found in any of its {len(times)} frames")
-    return build_track(times, found, size, settings, source, detector.description())
-
-
-def build_track(
-    times: Sequence[float],
-    found: Sequence[FaceDetection | None],
-    image_size: tuple[int, int],
-    settings: ExtractSettings,
-    source: dict[str, Any],
-    detector: dict[str, Any],
-) -> FaceTrack:
-    """Put detections (one per decoded frame, None: no face) at a constant rate."""
     nowhere = FaceDetection(np.full((NUM_LANDMARKS, 3), np.nan), np.full((4, 4), np.nan))
     samples = Samples(
         timestamps=np.array(times),
@@ -378,13 +366,13 @@ def build_track(
         interpolated=interpolated,
         timestamps=track.timestamps,
         head_pose=track.head_pose,
-        jaw=jaw_openings(track.landmarks, track.head_pose, image_size).astype(np.float32),
-        image_size=image_size,
+        jaw=jaw_openings(track.landmarks, track.head_pose, size).astype(np.float32),
+        image_size=size,
         fps=float(fps),
         source_timestamps=samples.timestamps,
         source_valid=samples.valid,
         source=source,
-        detector=settings.record(detector),
+        detector=settings.record(detector.description()),
     )
 
 
@@ -402,6 +390,5 @@ def is_track_up_to_date(
         track = load_track(out)
     except RequestError as error:
         raise RequestError(f"{error}; it is in the way of a track, so remove it first") from None
-    return track.source.get("sha256") == source_hash and dict(track.detector) == settings.record(
-        detector
-    )
+    made_so = dict(track.detector) == settings.record(detector)
+    return made_so and track.source.get("sha256") == source_hash

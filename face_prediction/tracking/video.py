@@ -25,14 +25,6 @@ class VideoFrame:
     image: np.ndarray
 
 
-@dataclass(frozen=True)
-class VideoInfo:
-    """Header of a video. ``expected_frames`` is 0 where the header does not give it."""
-
-    expected_frames: int
-    average_rate: float
-
-
 def require_video(path: Path) -> None:
     """Check that ``path`` is a file that can be read.
 
@@ -54,6 +46,10 @@ def require_video(path: Path) -> None:
 
 class VideoReader:
     """Reads one video with PyAV. Use as a context manager.
+
+    Attributes:
+        expected_frames: frames by the header; 0 where it does not give them.
+        average_rate: frames per second by the header; 0 where it does not give it.
 
     Raises:
         RequestError: the file is no video, holds no video stream, or breaks off before its end;
@@ -84,7 +80,8 @@ class VideoReader:
             expected = int(stream.duration * stream.time_base * stream.average_rate)
         elif stream.average_rate and self._container.duration and len(self._container.streams) == 1:
             expected = int(self._container.duration / 1e6 * float(stream.average_rate))
-        self.info = VideoInfo(expected, float(stream.average_rate or stream.guessed_rate or 0.0))
+        self.expected_frames = expected
+        self.average_rate = float(stream.average_rate or stream.guessed_rate or 0.0)
 
     def __enter__(self) -> VideoReader:
         return self
@@ -120,10 +117,9 @@ class VideoReader:
                 f"{self._path}: breaks off after {count} frames ({error.strerror}); "
                 "truncated or damaged"
             ) from None
-        expected = self.info.expected_frames
-        if count < WHOLE_SHARE * expected:
+        if count < WHOLE_SHARE * self.expected_frames:
             raise RequestError(
-                f"{self._path}: truncated, its header promises {expected} frames "
+                f"{self._path}: truncated, its header promises {self.expected_frames} frames "
                 f"and {count} can be decoded"
             )
         if count == 0:
