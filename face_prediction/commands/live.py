@@ -32,8 +32,6 @@ SHIPPED = "shipped"
 UNFITTED = ("persistence", "constant_velocity", "line")
 """Baselines without parameters."""
 
-LiveForecaster = LandmarkForecaster | NetworkForecaster
-
 
 @dataclass(frozen=True)
 class LiveOptions:
@@ -86,9 +84,8 @@ def run_live(options: LiveOptions) -> int:
         sink = window_sink() if options.out is None else video_sink(options.out, rate)
         show = stack.enter_context(sink)
         find = stack.enter_context(face_finder(model))
-        frames = stack.enter_context(
-            closing(live_frames(options.video, options.camera, options.seconds))
-        )
+        frames = live_frames(options.video, options.camera, options.seconds)
+        stack.enter_context(closing(frames))
         predictor = StreamingPredictor(forecaster, settings)
         try:
             run_loop(frames, find, predictor, show, name, settings.history, statistics)
@@ -98,10 +95,8 @@ def run_live(options: LiveOptions) -> int:
             code = 130
     if options.out is not None:
         logger.info("%s: %d frames", options.out, statistics.frames)
-    logger.info(
-        "face in %d of %d frames, crops laid: %d",
-        *(statistics.faces, statistics.frames, statistics.crops),
-    )
+    counts = (statistics.faces, statistics.frames, statistics.crops)
+    logger.info("face in %d of %d frames, crops laid: %d", *counts)
     print(statistics.times_table())  # noqa: T201
     return code
 
@@ -130,7 +125,7 @@ def check_live_options(options: LiveOptions) -> None:
 
 def load_forecaster(
     checkpoint: str, dataset: Path | None
-) -> tuple[str, LiveForecaster, SequenceSettings]:
+) -> tuple[str, LandmarkForecaster | NetworkForecaster, SequenceSettings]:
     """Name, forecasts and sequence settings of a network or a baseline.
 
     A baseline with parameters is fitted to every sequence of the dataset.

@@ -172,28 +172,26 @@ def track_frames(
     Raises:
         RequestError: the video breaks off, or its frames are not those of the track.
     """
+
+    def wrong(problem: str) -> RequestError:
+        return RequestError(f"{path}: {problem}; extract the track again")
+
     times = track.source_timestamps
     count = 0
     with VideoReader(path) as video:
         for frame in with_bar(video.frames(), len(times), label):
             height, width = frame.image.shape[:2]
             if (width, height) != track.image_size:
-                raise RequestError(
-                    f"{path}: {width}x{height} pixels, its track says "
-                    f"{track.image_size[0]}x{track.image_size[1]}; extract the track again"
-                )
+                theirs = "x".join(map(str, track.image_size))
+                raise wrong(f"{width}x{height} pixels, its track says {theirs}")
             if count < len(times):
                 if abs(frame.time - times[count]) > SAME_CLOCK:
-                    raise RequestError(
-                        f"{path}: frame {count} is at {frame.time:.4f} s, its track says "
-                        f"{times[count]:.4f} s; extract the track again"
-                    )
+                    at = f"frame {count} is at {frame.time:.4f} s"
+                    raise wrong(f"{at}, its track says {times[count]:.4f} s")
                 yield count, frame.image
             count += 1
     if count != len(times):
-        raise RequestError(
-            f"{path}: {count} frames, its track says {len(times)}; extract the track again"
-        )
+        raise wrong(f"{count} frames, its track says {len(times)}")
 
 
 def cut_images(
@@ -231,35 +229,24 @@ def cut_images(
 
 def kind_table(clips: Sequence[ClipEntry], rows: Sequence[SequenceRow]) -> str:
     """Markdown: per kind of footage, counts and the medians of statistics."""
-
-    def cells(name: str, clips: Sequence[ClipEntry], rows: Sequence[SequenceRow]) -> list[object]:
-        medians = [
-            " ".join(
-                f"{factor * float(np.median([row.statistics[key] for row in rows])):.{digits}f}"
-                for key in keys
-            )
-            if rows
-            else "–"
-            for _, keys, factor, digits in _MEDIANS
-        ]
-        return [
-            name,
-            len({clip.subject for clip in clips if clip.sequences}),
-            sum(clip.sequences > 0 for clip in clips),
-            sum(clip.candidates == 0 for clip in clips),
-            sum(clip.sequences for clip in clips),
-            *(sum(clip.dropped.get(reason, 0) for clip in clips) for reason in REASONS),
-            *medians,
-        ]
-
     head = ["footage", "subjects", "clips", "too short", "sequences"]
     head += [name.replace("_", " ") for name in REASONS] + [heading for heading, *_ in _MEDIANS]
-    by_kind = [
-        cells(kind, part, [row for row in rows if row.kind == kind])
-        for kind in KINDS
-        if (part := [clip for clip in clips if clip.kind == kind])
-    ]
-    return "\n".join(markdown_table(head, [*by_kind, cells("all", clips, rows)]))
+    table: list[list[object]] = []
+    for kind in (*KINDS, "all"):
+        part = [clip for clip in clips if kind in ("all", clip.kind)]
+        found = [row.statistics for row in rows if kind in ("all", row.kind)]
+        if not part and kind != "all":
+            continue
+        people = len({clip.subject for clip in part if clip.sequences})
+        sums = [sum(clip.sequences > 0 for clip in part), sum(not c.candidates for c in part)]
+        sums.append(sum(clip.sequences for clip in part))
+        sums += [sum(clip.dropped.get(reason, 0) for clip in part) for reason in REASONS]
+        table.append([kind, people, *sums])
+        for _, keys, factor, digits in _MEDIANS:
+            columns = [[row[key] for row in found] for key in keys] if found else []
+            medians = [factor * float(np.median(column)) for column in columns]
+            table[-1].append(" ".join(f"{value:.{digits}f}" for value in medians) or "–")
+    return "\n".join(markdown_table(head, table))
 
 
 def fold_table(clips: Sequence[ClipEntry], folds: int) -> str:

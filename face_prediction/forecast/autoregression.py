@@ -57,10 +57,8 @@ def moments(series: Floats, order: int) -> Floats:
     the third axis) and with the values 1...P frames ago.
     """
     size, components = series.shape[1:]
-    lagged = np.stack(
-        [series[:, order - k : size - k] for k in range(1, order + 1)], axis=2
-    )  # (N, T - P, P, D)
-    rows = lagged.reshape(-1, order * components)
+    lagged = [series[:, order - k : size - k] for k in range(1, order + 1)]  # P of (N, T - P, D)
+    rows = np.stack(lagged, axis=2).reshape(-1, order * components)
     target = series[:, order:].reshape(-1, components)
     shape = (order, components, -1, components)
     products = [(rows.T @ columns).reshape(shape) for columns in (target, rows)]
@@ -134,16 +132,12 @@ def held_out_errors(
     """
     longest = max(order for order, _ in candidates)
     if len(set(subjects)) < 2:
-        raise RequestError(
-            "sequences of 1 subject; an order is chosen on people held out: give 2 or more "
-            "subjects, or the order"
-        )
+        needed = "an order is chosen on people held out: give 2 or more subjects, or the order"
+        raise RequestError(f"sequences of 1 subject; {needed}")
     steps = series.shape[1]
     if steps - horizon < longest:
-        raise RequestError(
-            f"sequences of {steps + 1} frames; order {longest} and horizon {horizon} need "
-            f"{longest + horizon + 1} or more"
-        )
+        needed = f"order {longest} and horizon {horizon} need {longest + horizon + 1} or more"
+        raise RequestError(f"sequences of {steps + 1} frames; {needed}")
     # ends of histories, the last first, each with ``horizon`` steps after it
     origins = range(steps - horizon, longest - 1, -_ORIGIN_STEP)[:_ORIGINS]
     fold = subject_folds(subjects, FOLDS)

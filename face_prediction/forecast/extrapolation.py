@@ -213,11 +213,8 @@ def fit_noise(series: NDArray[np.float64]) -> tuple[float, float, float]:
 
     # where the mouth moves smoothly and the detector trembles, or the other way round
     starts = ([-2.0, 0.0], [0.0, 1.0])
-    fits = [
-        minimize(cost, start, method="Nelder-Mead", bounds=_BOUNDS, options={"xatol": 1e-3})
-        for start in starts
-    ]
-    best = min(fits, key=lambda fit: fit.fun)
+    how = {"method": "Nelder-Mead", "bounds": _BOUNDS, "options": {"xatol": 1e-3}}
+    best = min((minimize(cost, start, **how) for start in starts), key=lambda fit: fit.fun)
     q_ratio, v_ratio = 10.0**best.x
     r = max(_profile(series, q_ratio, v_ratio)[1], _SMALLEST_VARIANCE)
     return q_ratio * r, r, v_ratio * r

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from face_prediction.tracking.geometry import CENTIMETRE
-from face_prediction.tracking.tracks import NUM_LANDMARKS
+from face_prediction.tracking.tracks import NUM_LANDMARKS, Size
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file, file_digest
 
@@ -116,7 +116,7 @@ class FaceDetection:
     landmarks: np.ndarray
     head_pose: np.ndarray
 
-    def box(self, image_size: tuple[int, int]) -> tuple[np.ndarray, float]:
+    def box(self, image_size: Size) -> tuple[np.ndarray, float]:
         """Middle (2,) and width of the box around the face, in pixels."""
         points = self.landmarks[:, :2] * image_size
         low, high = points.min(axis=0), points.max(axis=0)

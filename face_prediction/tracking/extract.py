@@ -27,7 +27,7 @@ from face_prediction.tracking.geometry import (
     read_canonical_face,
     slerp,
 )
-from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, load_track
+from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, Size, load_track
 from face_prediction.tracking.video import VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
@@ -124,11 +124,8 @@ def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Sam
     weight = np.where(np.abs(wanted - times[after]) < SAME_TIME, 1.0, weight)
     between = (weight > 0.0) & (weight < 1.0)
     nearest = np.where(weight == 1.0, after, before)
-    valid = np.where(
-        between,
-        source.valid[before] & source.valid[after] & (gap <= max_gap + 1e-6),
-        source.valid[nearest],
-    )
+    bridged = source.valid[before] & source.valid[after] & (gap <= max_gap + 1e-6)
+    valid = np.where(between, bridged, source.valid[nearest])
 
     def mix(array: np.ndarray) -> np.ndarray:
         filled = np.nan_to_num(array)  # NaN * 0 would spoil a frame that does not need this one
@@ -223,7 +220,7 @@ def is_well_inside(window: Crop, centre: np.ndarray, width: float) -> bool:
     )
 
 
-def window_around(centre: np.ndarray, width: float, image_size: tuple[int, int]) -> Crop | None:
+def window_around(centre: np.ndarray, width: float, image_size: Size) -> Crop | None:
     """The window for a face of this middle (2,) and width in pixels; None for a large face."""
     longer, shorter = max(image_size), min(image_size)
     side = round(WINDOW_FACES * width)
@@ -236,7 +233,7 @@ def window_around(centre: np.ndarray, width: float, image_size: tuple[int, int])
     return Crop(left, top, side)
 
 
-def search_windows(image_size: tuple[int, int]) -> list[Crop]:
+def search_windows(image_size: Size) -> list[Crop]:
     """Squares of half the shorter side that overlap by half, over the whole image."""
     side = min(image_size) // 2
     if side < 2:
@@ -249,7 +246,7 @@ def search_windows(image_size: tuple[int, int]) -> list[Crop]:
 
 
 def whole_image_detection(
-    face: FaceDetection, window: Crop, image_size: tuple[int, int], canonical: CanonicalFace
+    face: FaceDetection, window: Crop, image_size: Size, canonical: CanonicalFace
 ) -> FaceDetection:
     """A face found in ``window``, in the coordinates and under the camera of the whole image."""
     width, height = image_size
@@ -268,7 +265,7 @@ class FaceFollower:
         self.reacquired = 0
 
     def choose(
-        self, faces: Sequence[FaceDetection], time: float, image_size: tuple[int, int]
+        self, faces: Sequence[FaceDetection], time: float, image_size: Size
     ) -> FaceDetection | None:
         """The tracked face among ``faces`` at ``time`` seconds, or None when it is not there.
 

@@ -21,6 +21,9 @@ VERSION = 1
 NUM_LANDMARKS = 468
 """MediaPipe's face mesh; the ten iris points that the detector adds are not kept."""
 
+Size = tuple[int, int]
+"""Width and height of an image in pixels, as displayed."""
+
 _ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "landmarks": ("float32", ("T", NUM_LANDMARKS, 3)),
     "valid": ("bool", ("T",)),
@@ -72,7 +75,7 @@ class FaceTrack:
     timestamps: np.ndarray
     head_pose: np.ndarray
     jaw: np.ndarray
-    image_size: tuple[int, int]
+    image_size: Size
     fps: float
     source_timestamps: np.ndarray
     source_valid: np.ndarray
