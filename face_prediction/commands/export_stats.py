@@ -119,10 +119,8 @@ def run_export_stats(options: ExportStatsOptions) -> int:
     )
     save_predictor_error_stats(options.out, stats)
     logger.info("crops span %.3f m at the mouth (median)", span)
-    logger.info(
-        "%s: %s on %d forecasts of kind %s, %d subjects",
-        *(options.out, stats.predictor, stats.sequences, stats.footage, stats.subjects),
-    )
+    counts = (stats.predictor, stats.sequences, stats.footage, stats.subjects)
+    logger.info("%s: %s on %d forecasts of kind %s, %d subjects", options.out, *counts)
     print(error_stats_table(stats))  # noqa: T201
     return 0
 

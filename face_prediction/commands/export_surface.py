@@ -68,10 +68,8 @@ def run_export_surface(options: ExportSurfaceOptions) -> None:
             left, the mouth never opens, or MediaPipe, which knows the mesh, is not installed.
     """
     if options.max_frames < 1 or options.min_frames < 2:
-        raise RequestError(
-            f"--max_frames {options.max_frames} --min_frames {options.min_frames}: "
-            "at least 1 and 2 are needed"
-        )
+        given = f"--max_frames {options.max_frames} --min_frames {options.min_frames}"
+        raise RequestError(f"{given}: at least 1 and 2 are needed")
     require_out_file(options.out)
     clips: list[Attribution] = []
     subjects: dict[str, list[np.ndarray]] = defaultdict(list)  # faces (T, 468, 3) of each clip

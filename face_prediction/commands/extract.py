@@ -98,8 +98,7 @@ def output_paths(videos: Iterable[Path], out: Path) -> list[tuple[Path, Path]]:
     seen: dict[Path, Path] = {}
     for video, path in pairs:
         if path in seen:
-            raise RequestError(
-                f"{seen[path]} and {video} would both become {path}; extract them to two folders"
-            )
+            two = f"{seen[path]} and {video}"
+            raise RequestError(f"{two} would both become {path}; extract them to two folders")
         seen[path] = video
     return pairs

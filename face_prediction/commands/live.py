@@ -138,16 +138,13 @@ def load_forecaster(
         known = LandmarkSequences(np.zeros((1, 1, NUM_LANDMARKS, 2), np.float32), ("nobody",))
         if checkpoint not in UNFITTED:
             if dataset is None:
-                raise RequestError(
-                    f"--checkpoint {checkpoint}: has parameters; name a --dataset to fit it to"
-                )
+                missing = "has parameters; name a --dataset to fit it to"
+                raise RequestError(f"--checkpoint {checkpoint}: {missing}")
             with FaceDataset(dataset) as opened:
                 settings = opened.manifest.settings
                 every = opened.indices().tolist()
-                known = LandmarkSequences(
-                    np.stack([opened.landmarks(i)[..., :2] for i in every]),
-                    tuple(opened.entry(i).subject for i in every),
-                )
+                landmarks = np.stack([opened.landmarks(i)[..., :2] for i in every])
+                known = LandmarkSequences(landmarks, tuple(opened.entry(i).subject for i in every))
         predictor = BaselinePredictor(fit_forecaster(checkpoint, known))
         return checkpoint, LandmarkForecaster(predictor, HORIZON), settings
     folder = Path(checkpoint)

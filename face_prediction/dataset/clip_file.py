@@ -181,10 +181,8 @@ def open_clip(path: Path) -> h5py.File:
         except READ_ERRORS as error:
             raise RequestError(f"{path}: {damage(error)}") from None
         if schema != SCHEMA or version != VERSION:
-            raise RequestError(
-                f"{path}: schema '{schema}' version {version}, expected '{SCHEMA}' {VERSION}; "
-                "make the dataset again"
-            )
+            expected = f"expected '{SCHEMA}' {VERSION}; make the dataset again"
+            raise RequestError(f"{path}: schema '{schema}' version {version}, {expected}")
         stack.pop_all()
         return file
 

@@ -98,9 +98,8 @@ def assign_folds(clips: Iterable[ClipEntry], folds: int, seed: int) -> dict[str,
     total = sum(of_kind.values())
     people = [name for name in sorted(by_subject) if sum(by_subject[name].values()) > 0]
     if len(people) < folds:
-        raise RequestError(
-            f"--folds {folds}: only {len(people)} subjects have sequences; give at most that many"
-        )
+        limit = f"only {len(people)} subjects have sequences; give at most that many"
+        raise RequestError(f"--folds {folds}: {limit}")
     rng = np.random.default_rng([seed, *b"folds"])
     shuffled = [people[i] for i in rng.permutation(len(people))]
     shuffled.sort(key=lambda name: -sum(by_subject[name].values()))
@@ -181,9 +180,8 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / MANIFEST_NAME
     if not path.is_file():
-        raise RequestError(
-            f"{folder}: no dataset ({MANIFEST_NAME} is not there); make one with build-dataset"
-        )
+        missing = f"no dataset ({MANIFEST_NAME} is not there)"
+        raise RequestError(f"{folder}: {missing}; make one with build-dataset")
     again = "make the dataset again"
     try:
         data = read_json(path)
@@ -203,9 +201,8 @@ def read_manifest(folder: Path) -> Manifest:
         if Path(clip.clip).name != clip.clip:
             raise RequestError(f"{path}: '{clip.clip}' is no name of a clip")
         if clip.sequences and clip.fold not in range(manifest.folds):
-            raise RequestError(
-                f"{path}: clip '{clip.clip}' is in fold {clip.fold}, there are {manifest.folds}"
-            )
+            wrong = f"is in fold {clip.fold}, there are {manifest.folds}"
+            raise RequestError(f"{path}: clip '{clip.clip}' {wrong}")
         if fold_of.setdefault(clip.subject, clip.fold) != clip.fold:
             raise RequestError(f"{path}: subject '{clip.subject}' is in two folds")
     if len({clip.clip for clip in manifest.clips}) < len(manifest.clips):

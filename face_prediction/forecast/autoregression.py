@@ -166,9 +166,8 @@ def least_error(errors: Mapping[tuple[int, int], float]) -> tuple[int, int]:
 def require_order(order: int, steps: int) -> None:
     """Raise RequestError unless ``steps`` displacements a sequence leave rows to fit ``order``."""
     if not 1 <= order < steps:
-        raise RequestError(
-            f"order {order}: must be 1 to {steps - 1} for sequences of {steps + 1} frames"
-        )
+        needed = f"must be 1 to {steps - 1} for sequences of {steps + 1} frames"
+        raise RequestError(f"order {order}: {needed}")
 
 
 @dataclass(frozen=True)
@@ -183,9 +182,8 @@ class _Autoregression(Forecaster):
     def _check_coefficients(self, components: int) -> None:
         shape = self.coefficients.shape
         if len(shape) != 3 or shape[0] < 1 or shape[1:] != (components, components):
-            raise RequestError(
-                f"{self.name}: coefficients {shape}; expected (order, {components}, {components})"
-            )
+            expected = f"(order, {components}, {components})"
+            raise RequestError(f"{self.name}: coefficients {shape}; expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -240,9 +238,8 @@ class LandmarkAutoregression(_Autoregression):
         components = len(self.basis)
         self._check_coefficients(components)
         if self.basis.shape != (components, 2 * NUM_LANDMARKS):
-            raise RequestError(
-                f"{self.name}: basis {self.basis.shape}; expected (any, {2 * NUM_LANDMARKS})"
-            )
+            expected = f"(any, {2 * NUM_LANDMARKS})"
+            raise RequestError(f"{self.name}: basis {self.basis.shape}; expected {expected}")
 
     @classmethod
     def fit(

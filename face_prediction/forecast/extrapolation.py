@@ -154,9 +154,9 @@ class KalmanConstantVelocity(Forecaster):
             RequestError: the sequences have fewer than 4 frames.
         """
         mouth = mouth_centre(sequences.landmarks)
-        if mouth.shape[1] < 4:
+        if (frames := mouth.shape[1]) < 4:
             raise RequestError(
-                f"kalman: sequences of {mouth.shape[1]} frames; 4 or more are needed to fit noise"
+                f"kalman: sequences of {frames} frames; 4 or more needed to fit noise"
             )
         q, r, v = np.array([fit_noise(mouth[..., axis]) for axis in range(2)]).T
         return cls(q, r, v)

@@ -290,10 +290,8 @@ class RecordedMotion:
         """One line: seconds, runs, subjects and the shortest run."""
         subjects = len(set(self.run_subject.tolist()))
         shortest = float(np.min(self.run_length - 1)) / self.fps
-        return (
-            f"{self.seconds:.1f} s in {len(self.run_start)} runs of {subjects} subjects, "
-            f"the shortest {shortest:.1f} s"
-        )
+        runs = f"{len(self.run_start)} runs of {subjects} subjects"
+        return f"{self.seconds:.1f} s in {runs}, the shortest {shortest:.1f} s"
 
     def settings(self) -> MotionSettings:
         """Settings that the library was made with.
@@ -302,14 +300,11 @@ class RecordedMotion:
             RequestError: its metadata hold none.
         """
         try:
-            stored = dict(self.metadata["settings"])
-            limits = QualityLimits(**stored.pop("limits"))
-            return MotionSettings(limits=limits, **stored)
+            stored = self.metadata["settings"]
+            return MotionSettings(**{**stored, "limits": QualityLimits(**stored["limits"])})
         except (KeyError, TypeError, ValueError) as error:
-            raise RequestError(
-                f"--library: its metadata hold no settings of export-motion ({error}); "
-                "make it again"
-            ) from None
+            wrong = f"its metadata hold no settings of export-motion ({error}); make it again"
+            raise RequestError(f"--library: {wrong}") from None
 
 
 def record_motion(
@@ -348,9 +343,8 @@ def motion_statistics(motion: ClipMotion, subject: str) -> dict[str, Any]:
         speed = np.linalg.norm(steps, axis=1) * motion.fps * 100
         row["speed_median_cm_s"] = round(float(np.median(speed)), 1)
         row["speed_p95_cm_s"] = round(float(np.percentile(speed, 95)), 1)
-        row["tremor_mm"] = [
-            round(1000 * max(step_tremor(part[:, axis]) for part in kept), 2) for axis in range(3)
-        ]
+        tremors = [max(step_tremor(part[:, axis]) for part in kept) for axis in range(3)]
+        row["tremor_mm"] = [round(1000 * tremor, 2) for tremor in tremors]
     return row
 
 
@@ -362,11 +356,7 @@ def join_runs(
     Raises:
         RequestError: no clip has a run, or the clips differ in rate.
     """
-    parts = [
-        (clip, subject, motion, slice(start, stop))
-        for clip, subject, motion in clips
-        for start, stop in motion.runs
-    ]
+    parts = [(*clip, slice(*run)) for clip in clips for run in clip[2].runs]
     if not parts:
         raise RequestError("no run is long enough and within reach; nothing to write")
     rates = {motion.fps for _, _, motion in clips}

@@ -191,16 +191,14 @@ class ZoomingDetector:
         if window is None or window == self._window:
             self._window = window
             return face
-        distances = [
-            (float(np.linalg.norm(closer.box(size)[0] - centre)), index, closer)
-            for index, closer in enumerate(self._through(window, image, time))
-        ]
-        if not distances or min(distances)[0] > width / 2:
+        faces = self._through(window, image, time)
+        distances = [float(np.linalg.norm(closer.box(size)[0] - centre)) for closer in faces]
+        if not distances or min(distances) > width / 2:
             self._window = None
             return face
         self._window = window
         self.windows += 1
-        return min(distances)[2]
+        return faces[int(np.argmin(distances))]
 
     def _through(self, window: Crop, image: np.ndarray, time: float) -> list[FaceDetection]:
         size = (image.shape[1], image.shape[0])
@@ -214,10 +212,8 @@ def is_well_inside(window: Crop, centre: np.ndarray, width: float) -> bool:
     """Return whether a face of this middle (2,) and width, in pixels, suits the window still."""
     middle = np.array([window.left, window.top]) + window.side / 2
     wanted = window.side / WINDOW_FACES
-    return bool(
-        np.all(np.abs(centre - middle) <= OFF_CENTRE * window.side)
-        and wanted / SIZE_CHANGE <= width <= wanted * SIZE_CHANGE
-    )
+    is_centred = bool(np.all(np.abs(centre - middle) <= OFF_CENTRE * window.side))
+    return is_centred and wanted / SIZE_CHANGE <= width <= wanted * SIZE_CHANGE
 
 
 def window_around(centre: np.ndarray, width: float, image_size: Size) -> Crop | None:
@@ -226,10 +222,8 @@ def window_around(centre: np.ndarray, width: float, image_size: Size) -> Crop | 
     side = round(WINDOW_FACES * width)
     if width >= SMALL_FACE * longer or side >= shorter:
         return None
-    left, top = (
-        int(np.clip(round(c - side / 2), 0, length - side))
-        for c, length in zip(centre, image_size, strict=True)
-    )
+    pairs = zip(centre, image_size, strict=True)
+    left, top = (int(np.clip(round(c - side / 2), 0, length - side)) for c, length in pairs)
     return Crop(left, top, side)
 
 
@@ -306,10 +300,10 @@ def extract_track(
     """
     digest = file_digest(path)
     follower = FaceFollower()
-    zooming = None
+    detect, zooming = detector.detect, None
     if settings.zoom:
-        zooming = ZoomingDetector(detector.detect, read_canonical_face(detector.model))
-    detect = zooming.detect if zooming else detector.detect
+        zooming = ZoomingDetector(detect, read_canonical_face(detector.model))
+        detect = zooming.detect
     times: list[float] = []
     found: list[FaceDetection | None] = []
     several = 0

@@ -65,9 +65,8 @@ class VideoReader:
         try:
             self._container = av.open(str(path))
         except (FFmpegError, OSError) as error:
-            raise RequestError(
-                f"{path}: cannot be opened as a video ({error.strerror}); truncated, or not a video"
-            ) from None
+            wrong = f"cannot be opened as a video ({error.strerror}); truncated, or not a video"
+            raise RequestError(f"{path}: {wrong}") from None
         if not self._container.streams.video:
             self._container.close()
             raise RequestError(f"{path}: holds no video stream")
@@ -102,9 +101,8 @@ class VideoReader:
         try:
             for packet in self._container.demux(self._stream):
                 if packet.is_corrupt:
-                    raise RequestError(
-                        f"{self._path}: breaks off after {count} frames; truncated or damaged"
-                    )
+                    wrong = f"breaks off after {count} frames; truncated or damaged"
+                    raise RequestError(f"{self._path}: {wrong}")
                 for frame in packet.decode():
                     count += 1
                     if frame.time is None or frame.time <= last:
@@ -113,15 +111,11 @@ class VideoReader:
                     image = frame.to_ndarray(format="rgb24")
                     yield VideoFrame(last, upright(image, frame.rotation))
         except FFmpegError as error:
-            raise RequestError(
-                f"{self._path}: breaks off after {count} frames ({error.strerror}); "
-                "truncated or damaged"
-            ) from None
+            wrong = f"breaks off after {count} frames ({error.strerror}); truncated or damaged"
+            raise RequestError(f"{self._path}: {wrong}") from None
         if count < WHOLE_SHARE * self.expected_frames:
-            raise RequestError(
-                f"{self._path}: truncated, its header promises {self.expected_frames} frames "
-                f"and {count} can be decoded"
-            )
+            wrong = f"its header promises {self.expected_frames} frames and {count} can be decoded"
+            raise RequestError(f"{self._path}: truncated, {wrong}")
         if count == 0:
             raise RequestError(f"{self._path}: holds no frame that can be decoded")
 

@@ -104,9 +104,8 @@ def open_board(logger: str, folder: Path, step: int, config: Mapping[str, Any]) 
             return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
         return _Wandb(folder, config)
     except ImportError as error:
-        raise RequestError(
-            f"{logger} is not installed: pip install {logger}, or say --logger none"
-        ) from error
+        remedy = f"pip install {logger}, or say --logger none"
+        raise RequestError(f"{logger} is not installed: {remedy}") from error
 
 
 class _Wandb:

@@ -61,10 +61,8 @@ class StepProgress:
         if self._bar.disable and self._shown and self.step % between < self._log_every:
             seconds = self.seconds
             left = seconds / self.step * (self.total - self.step)
-            logger.info(
-                "step %d of %d, loss %.4g, %.0f s, %.0f s left",
-                *(self.step, self.total, loss, seconds, left),
-            )
+            numbers = (self.step, self.total, loss, seconds, left)
+            logger.info("step %d of %d, loss %.4g, %.0f s, %.0f s left", *numbers)
             sys.stderr.flush()
 
     def __enter__(self) -> StepProgress:
