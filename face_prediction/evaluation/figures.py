@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.evaluation.errors import LEVELS
 from face_prediction.evaluation.scoring import EvaluationScores
 from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
@@ -76,7 +76,7 @@ def write_figures(
             size = predictor.image_size
             if not size:
                 continue
-            batch = SequenceBatch(setup.dataset, [index], ImagePlan.of(predictor.needs, [size]))
+            batch = SequenceBatch(setup.dataset, [index], predictor.needs, [size])
             forecast = predictor.forecast([row], batch)
             name = re.sub(r"\W+", "_", predictor.name).strip("_")
             draw_forecast(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.evaluation.errors import area_average, interval_levels, similarities
 from face_prediction.evaluation.predictors import Role, find_landmarks
 from face_prediction.evaluation.setup import EvaluationSetup, SequenceSelection
@@ -101,10 +101,11 @@ def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> Evaluatio
     last_images = {size: ImageNeeds(1, size) for size in setup.sizes}
     copies = {size: np.full(shape, np.nan) for size in setup.sizes if size > setup.common_size}
     needs = [needs for predictor in setup.predictors for needs in predictor.needs]
-    plan = ImagePlan.of([*needs, *last_images.values()], setup.sizes)
+    needs += last_images.values()
     with _progress_bar(len(selection) * len(rows), progress) as bar:
         for places in selection.batches(BATCH):
-            batch = SequenceBatch(dataset, selection.indices[places].tolist(), plan)
+            indices = selection.indices[places].tolist()
+            batch = SequenceBatch(dataset, indices, needs, setup.sizes)
             for predictor, row in zip(setup.predictors, rows, strict=True):
                 forecast = predictor.forecast(selection.rows_at(places), batch)
                 _score(row, places, forecast, batch, setup.common_size)
@@ -141,11 +142,11 @@ def score_shuffled_images(
         progress: show a progress bar.
     """
     indices, networks = setup.selection.indices, setup.image_networks
-    plan = ImagePlan.of(needs for network in networks for needs in network.needs)
+    needs = [needs for network in networks for needs in network.needs]
     with _progress_bar(len(indices) * len(networks), progress) as bar:
         for places in setup.selection.batches(BATCH):
-            images_of = indices[partners[places]].tolist()
-            batch = SequenceBatch(setup.dataset, indices[places].tolist(), plan, images_of)
+            own, images_of = indices[places].tolist(), indices[partners[places]].tolist()
+            batch = SequenceBatch(setup.dataset, own, needs, images_of=images_of)
             for network in networks:
                 forecast = network.forecast(setup.selection.rows_at(places), batch)
                 scores.row(network.name).shuffled_residuals[places] = mouth_residuals(
