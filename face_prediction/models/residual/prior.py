@@ -87,12 +87,7 @@ class Expert:
     periodic: bool = False
 
 
-BLOCKS = (
-    Block("shapes", 8, 3),
-    Block("shapes", 4, 6),
-    Block("shapes", 4, 2),
-    Block("mouth", 2, 4),
-)
+BLOCKS = (Block("shapes", 8, 3), Block("shapes", 4, 6), Block("shapes", 4, 2), Block("mouth", 2, 4))
 EXPERTS = (
     Expert(0, None),
     Expert(0, 10.0),
