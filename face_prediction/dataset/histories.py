@@ -21,7 +21,7 @@ from face_prediction.dataset.clip_file import decode_image, encode_image, reduct
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.forecast import mouth_centre
 from face_prediction.motion.motion import Quality
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.geometry import Crop, crop_around, image_points, image_rays
 from face_prediction.tracking.tracks import FaceTrack
 
@@ -86,7 +86,7 @@ def crop_history(
     return points[..., :2].astype(np.float32)
 
 
-def dataset_picture(
+def dataset_image(
     image: NDArray[np.uint8], crop: Crop, settings: SequenceSettings, size: int
 ) -> NDArray[np.uint8]:
     """The image (S, S, 3) of side ``size`` that a dataset holds of ``image`` under ``crop``.
@@ -106,7 +106,7 @@ def history_images(
     track: FaceTrack,
     source_frame: NDArray[np.integer],
     origins: Sequence[Origin],
-    needs: PictureNeeds,
+    needs: ImageNeeds,
     settings: SequenceSettings,
 ) -> Iterator[NDArray[np.uint8]]:
     """The images (P, S, S, 3) of each of ``origins``, whose frames must increase.
@@ -136,7 +136,7 @@ def history_images(
             wanted, crop = waiting.pop(), crops.pop()
             for n in wanted:
                 if (n, crop) not in cut:
-                    cut[n, crop] = dataset_picture(decoded[n], crop, settings, needs.size)
+                    cut[n, crop] = dataset_image(decoded[n], crop, settings, needs.size)
             yield np.stack([cut[n, crop] for n in wanted])
             if not waiting:
                 return

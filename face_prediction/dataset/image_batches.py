@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from face_prediction.dataset.clip_file import reduction
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ImagePlan:
     future: frozenset[int]
 
     @classmethod
-    def of(cls, needs: Iterable[PictureNeeds], future: Iterable[int] = ()) -> ImagePlan:
+    def of(cls, needs: Iterable[ImageNeeds], future: Iterable[int] = ()) -> ImagePlan:
         """The plan that serves all ``needs``, with the future at the sides ``future``."""
         history: dict[int, int] = {}
         for need in needs:
@@ -71,10 +71,10 @@ class SequenceBatch:
             stop = settings.length if size in plan.future else settings.history
             wanted = slice(settings.history - past, stop)
             reduce = reduction(settings.crop_size, size)
-            images = np.stack([dataset.pictures(index, wanted, reduce) for index in sources])
+            images = np.stack([dataset.images(index, wanted, reduce) for index in sources])
             self._past[size], self._future[size] = images[:, :past], images[:, past:]
 
-    def images(self, needs: PictureNeeds) -> NDArray[np.uint8] | None:
+    def images(self, needs: ImageNeeds) -> NDArray[np.uint8] | None:
         """Images (B, P, S, S, 3) of the last P frames of the history; None for P = 0."""
         if not needs.frames:
             return None

@@ -160,9 +160,9 @@ def draw_forecast(
     for number, line in enumerate(grid):
         label, item = ("truth", truth) if number < 2 else ("forecast", forecast)
         has_landmarks = number % 2 == 1
-        assert item.pictures is not None
+        assert item.images is not None
         for column, axes in enumerate(line):
-            axes.imshow(item.pictures[0, column], extent=(0, 1, 1, 0), interpolation="nearest")
+            axes.imshow(item.images[0, column], extent=(0, 1, 1, 0), interpolation="nearest")
             axes.set_xticks([])
             axes.set_yticks([])
             if has_landmarks:

@@ -17,7 +17,7 @@ from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.dataset.manifest import MANIFEST_NAME, SequenceRow
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.forecast import FORECASTERS, Forecaster, LandmarkSequences, fit_forecaster
-from face_prediction.prediction.interface import Forecast, PictureNeeds, Predictor
+from face_prediction.prediction.interface import Forecast, ImageNeeds, Predictor
 from face_prediction.tracking.detector import FaceDetection
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -48,10 +48,10 @@ class BaselinePredictor:
     def __init__(self, forecaster: Forecaster, image_size: int = 0) -> None:
         self.forecaster = forecaster
         self.name, self.memory = forecaster.name, forecaster.memory
-        self.needs = PictureNeeds(frames=1 if image_size else 0, size=image_size)
+        self.needs = ImageNeeds(frames=1 if image_size else 0, size=image_size)
 
     def predict(
-        self, landmarks: NDArray[np.floating], pictures: NDArray[np.uint8] | None, horizon: int
+        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
         """Forecast ``horizon`` frames; see `Predictor`.
 
@@ -64,10 +64,10 @@ class BaselinePredictor:
         if not self.needs.frames:
             return Forecast(forecast)
         expected = (len(landmarks), 1, self.needs.size, self.needs.size, 3)
-        if pictures is None or pictures.shape != expected:
-            given = None if pictures is None else pictures.shape
+        if images is None or images.shape != expected:
+            given = None if images is None else images.shape
             raise RequestError(f"{self.name}: images of shape {given}; expected {expected}")
-        return Forecast(forecast, np.repeat(pictures, horizon, axis=1))
+        return Forecast(forecast, np.repeat(images, horizon, axis=1))
 
 
 class LandmarkDetector(Protocol):
@@ -89,13 +89,13 @@ class DetectedPredictor:
         self._predictor, self._detector = predictor, detector
 
     def predict(
-        self, landmarks: NDArray[np.floating], pictures: NDArray[np.uint8] | None, horizon: int
+        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
         """Forecast images, and find the face in each; see `Predictor`."""
-        forecast = self._predictor.predict(landmarks, pictures, horizon)
-        if forecast.pictures is None:
+        forecast = self._predictor.predict(landmarks, images, horizon)
+        if forecast.images is None:
             return forecast
-        return replace(forecast, landmarks=find_landmarks(forecast.pictures, self._detector))
+        return replace(forecast, landmarks=find_landmarks(forecast.images, self._detector))
 
 
 def find_landmarks(images: NDArray[np.uint8], detector: LandmarkDetector) -> NDArray[np.float32]:
@@ -152,7 +152,7 @@ class EvaluatedPredictor:
     image_size: int = 0
 
     @property
-    def needs(self) -> list[PictureNeeds]:
+    def needs(self) -> list[ImageNeeds]:
         """Images that it needs, for each fold."""
         return [fitted.predictor.needs for fitted in self.by_fold.values()]
 
@@ -297,7 +297,7 @@ def fit_baselines(
     return [EvaluatedPredictor(name, fitted, "baseline") for name, fitted in by_fold.items()]
 
 
-def batch_size(needs: PictureNeeds) -> int:
+def batch_size(needs: ImageNeeds) -> int:
     """Number of histories to forecast at once."""
     one = needs.frames * needs.size**2 * 3
     return _LANDMARK_BATCH if one == 0 else int(np.clip(_IMAGE_BYTES // one, 1, _LANDMARK_BATCH))

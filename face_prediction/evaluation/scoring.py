@@ -17,7 +17,7 @@ from face_prediction.evaluation.errors import area_average, interval_levels, sim
 from face_prediction.evaluation.predictors import Role, find_landmarks
 from face_prediction.evaluation.setup import EvaluationSetup, SequenceSelection
 from face_prediction.prediction.errors import mouth_residuals, normalised_mean_errors
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 
 Floats = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> Evaluatio
     shape = (len(selection), dataset.manifest.settings.future)
     rows = [PredictorScores.empty(p.name, p.role, p.image_size, shape) for p in setup.predictors]
     true_images = PredictorScores.empty(TRUE_IMAGES, "reference", 0, shape)
-    last_images = {size: PictureNeeds(1, size) for size in setup.sizes}
+    last_images = {size: ImageNeeds(1, size) for size in setup.sizes}
     copies = {size: np.full(shape, np.nan) for size in setup.sizes if size > setup.common_size}
     needs = [needs for predictor in setup.predictors for needs in predictor.needs]
     plan = ImagePlan.of([*needs, *last_images.values()], setup.sizes)
@@ -172,11 +172,11 @@ def _score(
         if degrees is None:
             degrees = np.full(forecast.mouth_scale.shape[1:], np.inf)
         row.levels[places] = interval_levels(row.residuals[places], forecast.mouth_scale, degrees)
-    if forecast.pictures is not None:
+    if forecast.images is not None:
         truth = batch.future_images(row.image_size)
         # the truth is brought to the common side by the same way, so that no row gains by it
         row.similarity[places] = similarities(
-            area_average(forecast.pictures, common_size), area_average(truth, common_size)
+            area_average(forecast.images, common_size), area_average(truth, common_size)
         )
         if row.image_size > common_size:
-            row.own_similarity[places] = similarities(forecast.pictures, truth)
+            row.own_similarity[places] = similarities(forecast.images, truth)

@@ -220,8 +220,8 @@ def prepare_evaluation(
     for predictor in predictors:
         batch = SequenceBatch(dataset, [int(selection.indices[0])], ImagePlan.of(predictor.needs))
         forecast = predictor.forecast(selection.rows[:1], batch)
-        if forecast.pictures is not None:
-            sizes[predictor.name] = forecast.pictures.shape[2]
+        if forecast.images is not None:
+            sizes[predictor.name] = forecast.images.shape[2]
             reduction(crop_size, sizes[predictor.name])
             if np.isnan(forecast.landmarks).all():
                 without_landmarks.add(predictor.name)

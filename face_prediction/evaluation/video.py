@@ -198,7 +198,7 @@ def forecast_timeline(
         end = settings.length if place == len(indices) - 1 else settings.history
         frames += range(start + begin, start + end)
         mouth += list(centres[begin:end])
-        images += list(dataset.pictures(index, slice(begin, end)))
+        images += list(dataset.images(index, slice(begin, end)))
         crops += [crop] * (end - begin)
     return ForecastTimeline(
         clip=clip,

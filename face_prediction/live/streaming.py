@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.histories import dataset_image
 from face_prediction.dataset.sequences import SequenceSettings
-from face_prediction.prediction.interface import PictureNeeds, Predictor
+from face_prediction.prediction.interface import ImageNeeds, Predictor
 from face_prediction.tracking.extract import MAX_GAP, SAME_TIME
 from face_prediction.tracking.geometry import Crop, crop_around, image_points
 from face_prediction.tracking.tracks import NUM_LANDMARKS
@@ -77,7 +77,7 @@ class LandmarkForecaster:
 
     predictor: Predictor
     horizon: int
-    needs = PictureNeeds(frames=0, size=0)
+    needs = ImageNeeds(frames=0, size=0)
 
     def forecast(self, landmarks: NDArray[np.float32]) -> NDArray[np.float32]:
         """Landmarks (H, L, 2) after those (T, L, 2)."""
@@ -304,5 +304,5 @@ class StreamingPredictor:
         if frame.cut is None:
             assert frame.image is not None
             size = self._forecaster.needs.size
-            frame.cut = dataset_picture(frame.image, crop, self._settings, size)
+            frame.cut = dataset_image(frame.image, crop, self._settings, size)
         return frame.cut

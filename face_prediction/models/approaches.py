@@ -17,7 +17,7 @@ from torch.nn import functional
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History, Losses, Output, PredictorModel
 from face_prediction.models.settings import ApproachSettings, CrossAttentionSettings, FusionSettings
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 LANDMARK_NUMBERS = 2 * NUM_LANDMARKS
@@ -161,7 +161,7 @@ class ApproachModel(PredictorModel):
         super().__init__()
         self.history = settings.history
         self.horizon = settings.horizon
-        self.needs = PictureNeeds(frames=settings.history, size=settings.size)
+        self.needs = ImageNeeds(frames=settings.history, size=settings.size)
         self.span = 1
         self.makes_images = True
         self.landmark_decoder, self.landmark_weight = None, 0.0

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from torch import Generator, Tensor, nn
 
 from face_prediction.forecast.interface import LandmarkSequences
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class PredictorModel(nn.Module, ABC):
 
     history: int
     horizon: int
-    needs: PictureNeeds
+    needs: ImageNeeds
     span: int
     makes_images: bool
 

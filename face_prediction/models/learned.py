@@ -79,7 +79,7 @@ class LearnedPredictor:
         return self.record.folds["test"][0]
 
     def predict(
-        self, landmarks: NDArray[np.floating], pictures: NDArray[np.uint8] | None, horizon: int
+        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
         """Predict the next ``horizon`` frames; see `Predictor.predict`.
 
@@ -92,7 +92,7 @@ class LearnedPredictor:
         if not 1 <= horizon <= self.horizon:
             raise RequestError(f"horizon {horizon}: {self.name} forecasts 1 to {self.horizon}")
         landmarks = self._checked_landmarks(np.asarray(landmarks))
-        images = self._checked_images(pictures, len(landmarks))
+        images = self._checked_images(images, len(landmarks))
         device = next(self.model.parameters()).device
         batches: list[dict[str, NDArray[Any]]] = []
         freedom = None
@@ -110,7 +110,7 @@ class LearnedPredictor:
         unknown = np.full((len(landmarks), horizon, NUM_LANDMARKS, 2), np.nan, dtype=np.float32)
         return Forecast(
             landmarks=joined.get("landmarks", unknown),
-            pictures=joined.get("images"),
+            images=joined.get("images"),
             mouth_scale=joined.get("mouth_scale"),
             degrees_of_freedom=None
             if freedom is None
@@ -137,7 +137,7 @@ class LearnedPredictor:
             return np.empty(wanted, dtype=np.uint8)
         if images is None or images.shape != wanted or images.dtype != np.uint8:
             found = "none" if images is None else f"{images.dtype} of shape {images.shape}"
-            raise RequestError(f"pictures: {found}; {self.name} needs uint8 of shape {wanted}")
+            raise RequestError(f"images: {found}; {self.name} needs uint8 of shape {wanted}")
         return images
 
 

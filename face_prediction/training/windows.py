@@ -68,7 +68,7 @@ class SequenceImages:
         """
         if index not in self._kept:
             if self._frames_left < self._length:
-                return self._dataset.pictures(index, slice(start, stop), self._reduce)
+                return self._dataset.images(index, slice(start, stop), self._reduce)
             shape = (self._length, self._size, self._size, 3)
             self._kept[index] = np.empty(shape, np.uint8), np.zeros(self._length, dtype=bool)
             self._frames_left -= self._length
@@ -76,7 +76,7 @@ class SequenceImages:
         missing = np.flatnonzero(~is_decoded[start:stop])
         if len(missing):
             frames = slice(start + int(missing[0]), start + int(missing[-1]) + 1)
-            images[frames] = self._dataset.pictures(index, frames, self._reduce)
+            images[frames] = self._dataset.images(index, frames, self._reduce)
             is_decoded[frames] = True
         return images[start:stop]
 

@@ -28,7 +28,7 @@ from face_prediction.evaluation.predictors import (
     cross_fit,
 )
 from face_prediction.motion.library import RecordedMotion, save_motion
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 from face_prediction.tracking.geometry import crop_around
 from face_prediction.tracking.tracks import save_track
 from robo_manip_baselines.runs.errors import RequestError
@@ -91,13 +91,13 @@ class Watched:
     name = "watched"
     memory = None
 
-    def __init__(self, offset=(0.0, 0.0), needs: PictureNeeds | None = None) -> None:
+    def __init__(self, offset=(0.0, 0.0), needs: ImageNeeds | None = None) -> None:
         self.offset = np.array(offset)
-        self.needs = needs or PictureNeeds(0, 0)
+        self.needs = needs or ImageNeeds(0, 0)
         self.shown: list[tuple[np.ndarray, np.ndarray | None]] = []
 
-    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
-        self.shown.append((landmarks, pictures))
+    def predict(self, landmarks, images, horizon: int) -> Forecast:
+        self.shown.append((landmarks, images))
         ahead = np.repeat(landmarks[:, -1:], horizon, axis=1) + self.offset
         return Forecast(ahead.astype(np.float32))
 
@@ -188,13 +188,13 @@ def test_each_fold_is_forecast_by_its_own_predictor(options, monkeypatch) -> Non
         expected = 0.1 * fold_of[run.subject] - 0.015
         assert run.values[0][2][0] == pytest.approx(expected, abs=2e-6)
     for predictor in watched.values():
-        for landmarks, pictures in predictor.shown:
+        for landmarks, images in predictor.shown:
             assert landmarks.shape[1:] == (HISTORY, 468, 2)  # the future is not in it
-            assert pictures is None
+            assert images is None
 
 
 def test_pictures_are_the_last_of_the_history(options, monkeypatch) -> None:
-    watched = Watched(needs=PictureNeeds(3, 32))
+    watched = Watched(needs=ImageNeeds(3, 32))
     use(
         monkeypatch,
         EvaluatedPredictor(
@@ -202,12 +202,12 @@ def test_pictures_are_the_last_of_the_history(options, monkeypatch) -> None:
         ),
     )
     assert run_export_stats(replace(options, kind="head_motion")) == 0
-    ((_, pictures),) = watched.shown
+    ((_, images),) = watched.shown
     with FaceDataset(options.dataset) as dataset:
         (index,) = dataset.indices(kinds={"head_motion"}).tolist()
-        expected = dataset.pictures(index, slice(5, 8), 2)
-    assert pictures is not None
-    np.testing.assert_array_equal(pictures[0], expected)
+        expected = dataset.images(index, slice(5, 8), 2)
+    assert images is not None
+    np.testing.assert_array_equal(images[0], expected)
 
 
 def test_a_fold_without_a_checkpoint_is_left_out(options, monkeypatch) -> None:
@@ -270,7 +270,7 @@ def test_what_cannot_be_done_is_refused(options, change, message: str) -> None:
 
 
 def test_a_picture_size_that_the_dataset_has_not_is_refused(options, monkeypatch) -> None:
-    watched = Watched(needs=PictureNeeds(1, 48))
+    watched = Watched(needs=ImageNeeds(1, 48))
     use(
         monkeypatch,
         EvaluatedPredictor(
@@ -291,10 +291,10 @@ def test_other_files_are_not_overwritten(options, tmp_path: Path) -> None:
 
 
 def test_pictures_at_once_fit_in_memory() -> None:
-    assert batch_size(PictureNeeds(0, 0)) == 64
-    assert batch_size(PictureNeeds(70, 256)) == 4
-    assert batch_size(PictureNeeds(1, 16)) == 64
-    assert batch_size(PictureNeeds(1000, 256)) == 1
+    assert batch_size(ImageNeeds(0, 0)) == 64
+    assert batch_size(ImageNeeds(70, 256)) == 4
+    assert batch_size(ImageNeeds(1, 16)) == 64
+    assert batch_size(ImageNeeds(1000, 256)) == 1
 
 
 def predicted_library(tmp_path: Path) -> Path:

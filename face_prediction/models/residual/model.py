@@ -20,7 +20,7 @@ from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History, Losses, Output, PredictorModel
 from face_prediction.models.residual.prior import AdaptivePrior, PriorForecast
 from face_prediction.models.settings import ResidualSettings
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
@@ -295,7 +295,7 @@ class ResidualModel(PredictorModel):
         self.settings = settings
         self.history = settings.history
         self.horizon = settings.horizon
-        self.needs = PictureNeeds(settings.pictures, settings.size)
+        self.needs = ImageNeeds(settings.pictures, settings.size)
         self.span = 2
         self.makes_images = True
         self.prior = AdaptivePrior(settings.horizon, settings.shapes)

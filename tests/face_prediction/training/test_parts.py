@@ -105,7 +105,7 @@ class FakeDataset:
         self.folder = Path("fake")
         self.decoded: list[tuple[int, int, int]] = []
 
-    def pictures(self, index: int, frames: slice, reduce: int) -> np.ndarray:
+    def images(self, index: int, frames: slice, reduce: int) -> np.ndarray:
         self.decoded.append((index, frames.start, frames.stop))
         values = 20 * index + np.arange(frames.start, frames.stop)
         side = 64 // reduce
