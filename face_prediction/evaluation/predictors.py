@@ -244,12 +244,12 @@ def load_network(folder: Path, dataset_sha256: str) -> FittedPredictor:
     record = {
         "folder": folder.resolve().name,
         "name": network.name,
-        "preset": network.preset,
+        "preset": network.record.preset,
         "test_fold": network.test_fold,
-        "train_subjects": len(network.train_subjects),
+        "train_subjects": len(network.record.train_subjects),
         "sha256": file_digest(folder / "model.safetensors"),
     }
-    return FittedPredictor(network, frozenset(network.train_subjects), folder, record)
+    return FittedPredictor(network, frozenset(network.record.train_subjects), folder, record)
 
 
 def group_networks(loaded: Sequence[FittedPredictor]) -> list[EvaluatedPredictor]:

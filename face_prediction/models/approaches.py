@@ -117,8 +117,7 @@ class LandmarkDecoder(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return landmarks (B, H, L, 2) of tokens (B, H, D)."""
-        flat = self.out(functional.gelu(self.hidden(tokens)))
-        return flat.unflatten(-1, (NUM_LANDMARKS, 2))
+        return self.out(functional.gelu(self.hidden(tokens))).unflatten(-1, (NUM_LANDMARKS, 2))
 
 
 class CrossAttention(nn.Module):
@@ -159,24 +158,16 @@ class ApproachModel(PredictorModel):
 
     def __init__(self, settings: ApproachSettings) -> None:
         super().__init__()
-        self.history = settings.history
-        self.horizon = settings.horizon
-        self.needs = ImageNeeds(frames=settings.history, size=settings.size)
-        self.span = 1
-        self.makes_images = True
+        self.history, self.horizon, self.span = settings.history, settings.horizon, 1
+        self.needs = ImageNeeds(settings.history, settings.size)
         self.landmark_decoder, self.landmark_weight = None, 0.0
         self.image_encoder = ImageEncoder(settings.size, settings.channels, settings.width)
         self.future = nn.Parameter(0.02 * torch.randn(settings.horizon, settings.width))
         positions = sinusoids(settings.history + settings.horizon, settings.width)
         self.register_buffer("positions", positions, persistent=False)
+        sizes = (settings.width, settings.heads, settings.feedforward, settings.dropout)
         layer = nn.TransformerEncoderLayer(
-            settings.width,
-            settings.heads,
-            settings.feedforward,
-            settings.dropout,
-            activation="gelu",
-            batch_first=True,
-            norm_first=True,
+            *sizes, activation="gelu", batch_first=True, norm_first=True
         )
         self.transformer = nn.TransformerEncoder(
             layer, settings.layers, nn.LayerNorm(settings.width), enable_nested_tensor=False
@@ -274,10 +265,10 @@ class CrossAttentionModel(FusionModel):
 
     def __init__(self, settings: CrossAttentionSettings) -> None:
         super().__init__(settings)
-        d = settings.attention_width
-        self.attention = CrossAttention(settings.landmark_width, settings.width, d)
-        self.join = nn.Linear(d, settings.width)
-        for name, width in (("landmark", settings.landmark_width), ("image", settings.width)):
+        widths = {"landmark": settings.landmark_width, "image": settings.width}
+        self.attention = CrossAttention(*widths.values(), settings.attention_width)
+        self.join = nn.Linear(settings.attention_width, settings.width)
+        for name, width in widths.items():
             positions = sinusoids(settings.history, width)
             self.register_buffer(f"{name}_positions", positions, persistent=False)
 

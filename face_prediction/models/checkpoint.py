@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from face_prediction.models.interface import PredictorModel
-from face_prediction.models.settings import make_predictor_model, settings_class
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file, read_json, write_json
 
@@ -39,17 +38,15 @@ class CheckpointRecord:
 
     Attributes:
         model: name in the registry.
-        settings: JSON of its settings.
-        preset: name of the preset that they started from.
+        settings: JSON of its settings, which started from ``preset``.
         training: JSON of the `PredictorTrainSettings`.
-        seed: of the run.
         dataset: JSON of the dataset's `SequenceSettings`.
         dataset_sha256: of its ``dataset.json``.
         folds: folds by use: ``train``, ``validation``, ``test``.
         train_subjects: people trained on, on whom the network must not be evaluated.
         step: optimizer steps that made these weights.
         validation: losses and errors (crops) on the held-out fold, if there is one.
-        versions: of the software.
+        versions: of the software, by package.
     """
 
     model: str
@@ -101,24 +98,6 @@ def read_predictor_checkpoint(folder: Path) -> tuple[CheckpointRecord, dict[str,
             "give the training command again, which puts that right"
         )
     return record, tensors
-
-
-def load_predictor_model(
-    folder: Path, device: str = "cpu"
-) -> tuple[PredictorModel, CheckpointRecord]:
-    """Load the network of a checkpoint to ``device``, in eval mode.
-
-    Raises:
-        RequestError: as `read_predictor_checkpoint`, or the tensors do not fit the network.
-    """
-    record, tensors = read_predictor_checkpoint(folder)
-    try:
-        settings = settings_class(record.model).from_json(record.settings)
-    except RequestError as error:
-        raise RequestError(f"{folder / CONFIG_FILE}: {error}") from None
-    model = make_predictor_model(record.model, settings)
-    load_tensors(model, tensors, folder / MODEL_FILE)
-    return model.to(device).eval(), record
 
 
 def load_tensors(model: PredictorModel, tensors: Mapping[str, Tensor], source: Path) -> None:

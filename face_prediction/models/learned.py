@@ -12,17 +12,23 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from face_prediction.models.checkpoint import CheckpointRecord, load_predictor_model
+from face_prediction.models.checkpoint import (
+    CONFIG_FILE,
+    MODEL_FILE,
+    CheckpointRecord,
+    load_tensors,
+    read_predictor_checkpoint,
+)
 from face_prediction.models.interface import History, Output, PredictorModel
+from face_prediction.models.settings import make_predictor_model, settings_class
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
 
 
 class LearnedPredictor:
-    """Runs a network on batches of histories; see `face_prediction.prediction.interface.Predictor`.
+    """`Predictor` that runs a network on batches of histories.
 
     Args:
         model: on its device; put into eval mode.
@@ -30,14 +36,10 @@ class LearnedPredictor:
         batch_size: histories that go through the network at once.
 
     Attributes:
-        model: the network.
-        record: its provenance.
         name: of the network, in the registry.
-        preset: name of its size.
         memory: frames of landmarks that it sees; a history must have as many or more.
         needs: images that it sees.
         horizon: most frames that it predicts.
-        train_subjects: people it was trained on, on whom it must not be evaluated.
     """
 
     def __init__(
@@ -46,11 +48,7 @@ class LearnedPredictor:
         self.model = model.eval()
         self.record = record
         self.name = record.model
-        self.preset = record.preset
-        self.memory = model.history
-        self.needs = model.needs
-        self.horizon = model.horizon
-        self.train_subjects = tuple(record.train_subjects)
+        self.memory, self.needs, self.horizon = model.history, model.needs, model.horizon
         self._batch_size = batch_size
 
     @classmethod
@@ -62,7 +60,15 @@ class LearnedPredictor:
         Raises:
             RequestError: it is absent, damaged or of another schema.
         """
-        return cls(*load_predictor_model(Path(folder), device), batch_size)
+        folder = Path(folder)
+        record, tensors = read_predictor_checkpoint(folder)
+        try:
+            settings = settings_class(record.model).from_json(record.settings)
+        except RequestError as error:
+            raise RequestError(f"{folder / CONFIG_FILE}: {error}") from None
+        model = make_predictor_model(record.model, settings)
+        load_tensors(model, tensors, folder / MODEL_FILE)
+        return cls(model.to(device), record, batch_size)
 
     @property
     def test_fold(self) -> int:
@@ -95,27 +101,20 @@ class LearnedPredictor:
         images = self._checked_images(images, len(landmarks))
         device = next(self.model.parameters()).device
         batches: list[dict[str, NDArray[Any]]] = []
-        freedom = None
         for first in range(0, len(landmarks), self._batch_size):
             rows = slice(first, first + self._batch_size)
-            history = History(
-                torch.tensor(landmarks[rows], dtype=torch.float32, device=device),
-                torch.tensor(images[rows], device=device),
-            )
+            seen = torch.tensor(landmarks[rows], dtype=torch.float32, device=device)
             with torch.inference_mode():
-                output = self.model(history)
+                output = self.model(History(seen, torch.tensor(images[rows], device=device)))
             batches.append(_arrays(output, horizon))
-            freedom = output.degrees_of_freedom
         joined = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
-        unknown = np.full((len(landmarks), horizon, NUM_LANDMARKS, 2), np.nan, dtype=np.float32)
-        return Forecast(
-            landmarks=joined.get("landmarks", unknown),
-            images=joined.get("images"),
-            mouth_scale=joined.get("mouth_scale"),
-            degrees_of_freedom=None
-            if freedom is None
-            else freedom[:horizon].double().cpu().numpy(),
-        )
+        if "landmarks" not in joined:
+            shape = (len(landmarks), horizon, NUM_LANDMARKS, 2)
+            joined["landmarks"] = np.full(shape, np.nan, dtype=np.float32)
+        freedom = output.degrees_of_freedom
+        if freedom is not None:
+            joined["degrees_of_freedom"] = freedom[:horizon].double().cpu().numpy()
+        return Forecast(**joined)
 
     def _checked_landmarks(self, landmarks: NDArray[np.floating]) -> NDArray[np.floating]:
         shape = landmarks.shape
@@ -131,9 +130,8 @@ class LearnedPredictor:
         return landmarks
 
     def _checked_images(self, images: NDArray[np.uint8] | None, rows: int) -> NDArray[np.uint8]:
-        needs = self.needs
-        wanted = (rows, needs.frames, needs.size, needs.size, 3)
-        if images is None and not needs.frames:
+        wanted = (rows, self.needs.frames, self.needs.size, self.needs.size, 3)
+        if images is None and not self.needs.frames:
             return np.empty(wanted, dtype=np.uint8)
         if images is None or images.shape != wanted or images.dtype != np.uint8:
             found = "none" if images is None else f"{images.dtype} of shape {images.shape}"
@@ -143,10 +141,9 @@ class LearnedPredictor:
 
 def _arrays(output: Output, horizon: int) -> dict[str, NDArray[Any]]:
     """Return the outputs that there are, by name, for the first ``horizon`` frames."""
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays = {}
     for name in ("landmarks", "mouth_scale"):
-        values: Tensor | None = getattr(output, name)
-        if values is not None:
+        if (values := getattr(output, name)) is not None:
             arrays[name] = values[:, :horizon].float().cpu().numpy()
     if output.images is not None:
         images = (255 * output.images[:, :horizon].float()).round().clamp(0, 255).to(torch.uint8)

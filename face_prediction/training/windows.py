@@ -158,9 +158,9 @@ class SequenceWindows:
         self._indices = indices
         self._history = model.history
         self._seen = model.needs.frames
-        self._images = self._seen + (model.horizon if model.makes_images else 0)
+        self._images = self._seen + model.horizon
         self._size = model.needs.size
-        self._store = SequenceImages(dataset, self._size, memory) if self._images else None
+        self._store = SequenceImages(dataset, self._size, memory)
         points = [dataset.landmarks(int(index))[..., :2] for index in indices]
         self.frames = model.history + model.horizon
         subjects = tuple(dataset.entry(int(index)).subject for index in indices)
@@ -178,12 +178,10 @@ class SequenceWindows:
         frames = starts[:, None] + np.arange(self.frames)
         landmarks = torch.from_numpy(self.sequences.landmarks[rows[:, None], frames])
         images = np.empty((len(rows), self._images, self._size, self._size, 3), dtype=np.uint8)
-        if self._store is not None:
-            # one read: the images of history and future are neighbours
-            firsts = starts + self._history - self._seen
-            for place, (row, first) in enumerate(zip(rows, firsts.tolist(), strict=True)):
-                index = int(self._indices[row])
-                images[place] = self._store.read(index, first, first + self._images)
+        # one read: the images of history and future are neighbours
+        firsts = (starts + self._history - self._seen).tolist()
+        for place, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+            images[place] = self._store.read(int(self._indices[row]), first, first + self._images)
         seen, coming = torch.from_numpy(images).tensor_split([self._seen], dim=1)
         return WindowBatch(
             History(landmarks[:, : self._history], seen),
