@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
-from face_prediction.evaluation.errors import LEVELS
-from face_prediction.evaluation.scoring import EvaluationScores
+from face_prediction.evaluation.scoring import LEVELS, EvaluationScores
 from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
 from face_prediction.evaluation.statistics import KindSummary, RowSummary
 from face_prediction.prediction.errors import mouth_distances

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.evaluation.errors import coverage
 from face_prediction.evaluation.predictors import Role
-from face_prediction.evaluation.scoring import EvaluationScores
+from face_prediction.evaluation.scoring import EvaluationScores, coverage
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.prediction.errors import mouth_distances
 from robo_manip_baselines.runs.errors import RequestError

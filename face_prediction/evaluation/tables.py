@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from face_prediction.evaluation.error_stats import compact_json
-from face_prediction.evaluation.errors import LEVELS
+from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
 from robo_manip_baselines.runs.files import write_text

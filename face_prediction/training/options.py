@@ -111,7 +111,7 @@ class FaceTrainOptions:
 
 
 def _parsed(settings: tuple[str, ...]) -> dict[str, Any]:
-    values: dict[str, Any] = {}
+    values = {}
     for text in settings:
         name, equals, value = text.partition("=")
         if not equals:

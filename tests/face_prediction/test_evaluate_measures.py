@@ -10,18 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from face_prediction.evaluation.errors import (
-    LEVELS,
-    area_average,
-    coverage,
-    interval_levels,
-    similarities,
-)
 from face_prediction.evaluation.predictors import (
     DETECTOR_SIDE,
     BaselinePredictor,
     DetectedPredictor,
     find_landmarks,
+)
+from face_prediction.evaluation.scoring import (
+    LEVELS,
+    area_average,
+    coverage,
+    interval_levels,
+    similarities,
 )
 from face_prediction.forecast.extrapolation import ConstantVelocity, Persistence
 from face_prediction.prediction.interface import Forecast, ImageNeeds

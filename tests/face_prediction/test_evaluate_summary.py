@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from face_prediction.dataset.manifest import SequenceRow
-from face_prediction.evaluation.errors import LEVELS
 from face_prediction.evaluation.predictors import Role
-from face_prediction.evaluation.scoring import EvaluationScores, PredictorScores
+from face_prediction.evaluation.scoring import LEVELS, EvaluationScores, PredictorScores
 from face_prediction.evaluation.setup import SequenceSelection
 from face_prediction.evaluation.statistics import KindSummary, bootstrap_mean, summarise_kind
 from face_prediction.evaluation.tables import (

@@ -84,10 +84,15 @@ class LinearExpert:
 
 BLOCKS = (Block("shapes", 8, 3), Block("shapes", 4, 6), Block("shapes", 4, 2), Block("mouth", 2, 4))
 EXPERTS = (
-    *(LinearExpert(0, None), LinearExpert(0, 10.0)),
-    *(LinearExpert(1, 3.0), LinearExpert(1, 3.0, periodic=True)),
-    *(LinearExpert(2, None), LinearExpert(2, 1.0), LinearExpert(2, 1.0, periodic=True)),
-    *(LinearExpert(3, 3.0), LinearExpert(3, 1.0, periodic=True)),
+    LinearExpert(0, None),
+    LinearExpert(0, 10.0),
+    LinearExpert(1, 3.0),
+    LinearExpert(1, 3.0, periodic=True),
+    LinearExpert(2, None),
+    LinearExpert(2, 1.0),
+    LinearExpert(2, 1.0, periodic=True),
+    LinearExpert(3, 3.0),
+    LinearExpert(3, 1.0, periodic=True),
 )
 """Chosen on folds of the development clips among 54; see docs/predictors.md. The expert that
 expects no motion at all needs no line here."""

@@ -140,7 +140,7 @@ def test_help_does_not_load_torch(repository: Path) -> None:
 
 def test_without_torch_it_says_what_to_install(options, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "face_prediction.training.setup")
+    monkeypatch.delitem(sys.modules, "face_prediction.training.trainer")
     with pytest.raises(RequestError, match="pip install"):
         run_train(options)
 
