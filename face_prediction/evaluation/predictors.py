@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from face_prediction.dataset.manifest import MANIFEST_NAME, SequenceRow
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.forecast import FORECASTERS, Forecaster, LandmarkSequences, fit_forecaster
 from face_prediction.prediction.interface import Forecast, ImageNeeds, Predictor
-from face_prediction.tracking.detector import FaceDetection
+from face_prediction.tracking.detector import FaceDetector
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import file_digest
@@ -46,8 +46,7 @@ class BaselinePredictor:
     """
 
     def __init__(self, forecaster: Forecaster, image_size: int = 0) -> None:
-        self.forecaster = forecaster
-        self.name, self.memory = forecaster.name, forecaster.memory
+        self.forecaster, self.name, self.memory = forecaster, forecaster.name, forecaster.memory
         self.needs = ImageNeeds(frames=1 if image_size else 0, size=image_size)
 
     def predict(
@@ -70,21 +69,13 @@ class BaselinePredictor:
         return Forecast(forecast, np.repeat(images, horizon, axis=1))
 
 
-class LandmarkDetector(Protocol):
-    """Interface of `face_prediction.tracking.detector.FaceDetector` that is used here."""
-
-    def detect(self, image: np.ndarray, time: float) -> list[FaceDetection]:
-        """Faces in ``image`` (H, W, 3) uint8 RGB."""
-        ...
-
-
 class DetectedPredictor:
     """A predictor of images only, with the landmarks that a detector finds in them.
 
     Where no face is found the landmarks are NaN: a missing forecast.
     """
 
-    def __init__(self, predictor: Predictor, detector: LandmarkDetector) -> None:
+    def __init__(self, predictor: Predictor, detector: FaceDetector) -> None:
         self.name, self.memory, self.needs = predictor.name, predictor.memory, predictor.needs
         self._predictor, self._detector = predictor, detector
 
@@ -98,7 +89,7 @@ class DetectedPredictor:
         return replace(forecast, landmarks=find_landmarks(forecast.images, self._detector))
 
 
-def find_landmarks(images: NDArray[np.uint8], detector: LandmarkDetector) -> NDArray[np.float32]:
+def find_landmarks(images: NDArray[np.uint8], detector: FaceDetector) -> NDArray[np.float32]:
     """Landmarks (B, H, L, 2) in images (B, H, S, S, 3), normalised to them; NaN without a face.
 
     Of several faces the largest counts.
@@ -283,7 +274,7 @@ def fit_baselines(
     # copies of u and v: a view would keep the depth in memory, too
     frames = [dataset.landmarks(index)[..., :2].copy() for index in range(len(dataset))]
     for fold in folds:
-        known = dataset.indices(folds=set(range(dataset.manifest.folds)) - {fold}).tolist()
+        known = dataset.indices(folds={*range(dataset.manifest.folds)} - {fold}).tolist()
         if not known:
             raise RequestError(
                 f"{dataset.folder}: all its people are in fold {fold}, so nobody is left to fit "

@@ -22,6 +22,10 @@ from robo_manip_baselines.runs.errors import RequestError
 
 Floats = NDArray[np.float64]
 
+BATCH = 8
+"""Sequences at once: of these, 70 images of 256 x 256 each are 110 MB."""
+TRUE_IMAGES = "detector on the true pictures"
+"""Row of the landmarks that the detector finds in true images: as well as images can do."""
 SSIM_SIGMA = 1.5
 """Standard deviation (pixels) of the Gaussian window of Wang et al. 2004, which scikit-image cuts
 off at 3.5 of them: 11 pixels across, as in that paper."""
@@ -53,18 +57,12 @@ def similarities(forecast: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Float
             f"SSIM needs scikit-image ({error}); pip install "
             "'robo_manip_baselines[face_prediction]'"
         ) from None
+    wang = {"gaussian_weights": True, "sigma": SSIM_SIGMA, "use_sample_covariance": False}
     ours, true = forecast.astype(np.float32), truth.astype(np.float32)
     result = np.empty(truth.shape[:2])
     for place in np.ndindex(result.shape):
-        result[place] = structural_similarity(
-            ours[place],
-            true[place],
-            gaussian_weights=True,
-            sigma=SSIM_SIGMA,
-            use_sample_covariance=False,
-            data_range=255,
-            channel_axis=-1,
-        )
+        pair = ours[place], true[place]
+        result[place] = structural_similarity(*pair, data_range=255, channel_axis=-1, **wang)
     return result
 
 
@@ -126,12 +124,6 @@ def coverage(levels: NDArray[np.floating], nominal: tuple[float, ...] = LEVELS) 
     return np.where(np.expand_dims(known, -1), inside, np.nan)
 
 
-BATCH = 8
-"""Sequences at once: of these, 70 images of 256 x 256 each are 110 MB."""
-TRUE_IMAGES = "detector on the true pictures"
-"""Row of the landmarks that the detector finds in true images: as well as images can do."""
-
-
 @dataclass(frozen=True)
 class PredictorScores:
     """Scores of one row of the tables; NaN where it has no such forecast.
@@ -159,12 +151,10 @@ class PredictorScores:
     own_similarity: Floats
 
     @classmethod
-    def empty(
-        cls, name: str, role: Role, image_size: int, shape: tuple[int, int]
-    ) -> PredictorScores:
+    def empty(cls, name: str, role: Role, size: int, shape: tuple[int, int]) -> PredictorScores:
         """NaN for ``shape`` (N, H)."""
         pairs = [np.full((*shape, 2), np.nan) for _ in range(3)]
-        return cls(name, role, image_size, *pairs, *(np.full(shape, np.nan) for _ in range(3)))
+        return cls(name, role, size, *pairs, *(np.full(shape, np.nan) for _ in range(3)))
 
 
 @dataclass(frozen=True)
@@ -192,10 +182,6 @@ class EvaluationScores:
 def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> EvaluationScores:
     """Forecast every sequence by every predictor, and compare with the truth.
 
-    Args:
-        setup: sequences and predictors.
-        progress: show a progress bar.
-
     Raises:
         RequestError: a forecast is not as it should be, or the dataset is damaged.
     """
@@ -207,7 +193,8 @@ def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> Evaluatio
     copies = {size: np.full(shape, np.nan) for size in setup.sizes if size > setup.common_size}
     needs = [needs for predictor in setup.predictors for needs in predictor.needs]
     plan = ImagePlan.of([*needs, *last_images.values()], setup.sizes)
-    with _progress_bar(len(selection) * len(rows), progress) as bar:
+    total = len(selection) * len(rows)
+    with tqdm(total=total, unit="forecast", leave=False, disable=not progress) as bar:
         for places in selection.batches(BATCH):
             batch = SequenceBatch(dataset, selection.indices[places].tolist(), plan)
             for predictor, row in zip(setup.predictors, rows, strict=True):
@@ -217,9 +204,8 @@ def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> Evaluatio
             for size, copied in copies.items():
                 last = batch.images(last_images[size])
                 assert last is not None
-                copied[places] = similarities(
-                    np.repeat(last, shape[1], axis=1), batch.future_images(size)
-                )
+                last = np.repeat(last, shape[1], axis=1)
+                copied[places] = similarities(last, batch.future_images(size))
             if setup.detector is not None:
                 images = batch.future_images(setup.detected_size)
                 found = Forecast(find_landmarks(images, setup.detector))
@@ -237,30 +223,20 @@ def score_shuffled_images(
 ) -> None:
     """Fill in ``shuffled_residuals`` of every network that looks at images.
 
-    Landmarks stay a sequence's own; images are those of its partner.
-
-    Args:
-        setup: sequences and predictors.
-        scores: to be filled in.
-        partners: (N,) places of the sequences whose images stand in.
-        progress: show a progress bar.
+    Landmarks stay a sequence's own; images are those of the sequences at ``partners`` (N,).
     """
     indices, networks = setup.selection.indices, setup.image_networks
     plan = ImagePlan.of(needs for network in networks for needs in network.needs)
-    with _progress_bar(len(indices) * len(networks), progress) as bar:
+    total = len(indices) * len(networks)
+    with tqdm(total=total, unit="forecast", leave=False, disable=not progress) as bar:
         for places in setup.selection.batches(BATCH):
             images_of = indices[partners[places]].tolist()
             batch = SequenceBatch(setup.dataset, indices[places].tolist(), plan, images_of)
             for network in networks:
                 forecast = network.forecast(setup.selection.rows_at(places), batch)
-                scores.row(network.name).shuffled_residuals[places] = mouth_residuals(
-                    forecast.landmarks, batch.future
-                )
+                residuals = mouth_residuals(forecast.landmarks, batch.future)
+                scores.row(network.name).shuffled_residuals[places] = residuals
                 bar.update(len(places))
-
-
-def _progress_bar(total: int, shown: bool) -> tqdm:
-    return tqdm(total=total, unit="forecast", leave=False, disable=not shown)
 
 
 def _score(

@@ -25,7 +25,8 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.models.checkpoint import (
+from face_prediction.models.interface import PredictorModel
+from face_prediction.models.learned import (
     MODEL_FILE,
     CheckpointRecord,
     load_tensors,
@@ -35,7 +36,6 @@ from face_prediction.models.checkpoint import (
     save_predictor_checkpoint,
     write_tensors,
 )
-from face_prediction.models.interface import PredictorModel
 from face_prediction.models.settings import PredictorTrainSettings, make_predictor_model
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.options import FaceTrainOptions
@@ -123,9 +123,8 @@ def train_predictor(options: FaceTrainOptions) -> int:
         )
         trainer.train(stop)
     write_curves(folder / "curves.png", read_metrics(folder / METRICS_FILE), folder.name, CURVES)
-    logger.info(
-        "%s: %s", folder, "stopped; the same command carries on" if stop.is_made else "done"
-    )
+    end = "stopped; the same command carries on" if stop.is_made else "done"
+    logger.info("%s: %s", folder, end)
     return 130 if stop.is_made else 0
 
 
@@ -473,7 +472,10 @@ class PredictorTrainer:
 
 
 def held_out_errors(
-    model: PredictorModel, windows: SequenceWindows, batch_size: int, autocast: torch.autocast
+    model: PredictorModel,
+    windows: SequenceWindows,
+    settings: PredictorTrainSettings,
+    autocast: torch.autocast,
 ) -> dict[str, float]:
     """Return means over the sequences of the held-out fold, each at the end of its history.
 
@@ -484,8 +486,8 @@ def held_out_errors(
     """
     model.eval()
     sums: dict[str, list[float]] = {}
-    for first in range(0, len(windows), batch_size):
-        rows = np.arange(first, min(first + batch_size, len(windows)))
+    for first in range(0, len(windows), settings.batch_size):
+        rows = np.arange(first, min(first + settings.batch_size, len(windows)))
         batch = windows.batch(rows, np.full(len(rows), windows.validation_start))
         with torch.inference_mode(), autocast:
             numbers = _batch_errors(model, batch)

@@ -15,8 +15,7 @@ import torch
 
 from face_prediction.commands.train import run_train
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.models.checkpoint import read_predictor_checkpoint, read_tensors
-from face_prediction.models.learned import LearnedPredictor
+from face_prediction.models.learned import LearnedPredictor, read_predictor_checkpoint, read_tensors
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.training.options import FaceTrainOptions
