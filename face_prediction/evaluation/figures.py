@@ -65,26 +65,21 @@ def write_figures(
         RequestError: matplotlib is not installed, or the folder cannot be written to.
     """
     draw_errors(folder / "errors.png", summaries)
-    with_intervals = [s for s in summaries if any(row.has_intervals for row in s.rows)]
-    if with_intervals:
+    if with_intervals := [s for s in summaries if any(row.has_intervals for row in s.rows)]:
         draw_calibration(folder / "calibration.png", with_intervals)
     for summary in summaries:
         place = _lively_sequence(scores, summary.kind)
         index, row = int(setup.selection.indices[place]), setup.selection.rows[place]
         for predictor in setup.predictors:
-            size = predictor.image_size
-            if not size:
+            if not (size := predictor.image_size):
                 continue
             batch = SequenceBatch(setup.dataset, [index], ImagePlan.of(predictor.needs, [size]))
-            forecast = predictor.forecast([row], batch)
+            truth = Forecast(batch.future, batch.future_images(size))
             name = re.sub(r"\W+", "_", predictor.name).strip("_")
-            draw_forecast(
-                folder / f"forecast_{summary.kind}_{name}.png",
-                f"{predictor.name}, {summary.kind}: clip {row.clip}",
-                setup.dataset.manifest.settings.history + 1,
-                truth=Forecast(batch.future, batch.future_images(size)),
-                forecast=forecast,
-            )
+            path = folder / f"forecast_{summary.kind}_{name}.png"
+            title = f"{predictor.name}, {summary.kind}: clip {row.clip}"
+            first = setup.dataset.manifest.settings.history + 1
+            draw_forecast(path, title, first, truth, predictor.forecast([row], batch))
 
 
 def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
@@ -94,9 +89,7 @@ def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
     """
     ahead = np.arange(1, summaries[0].horizon + 1)
     figure, panels = _draw_curves(
-        summaries,
-        "distance",
-        ahead,
+        *(summaries, "distance", ahead),
         legend_room=1.0,
         has_curve=lambda row: True,
         has_band=lambda row, best: row.role == "network" or row.name == best,
@@ -112,9 +105,7 @@ def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
 def draw_calibration(path: Path, summaries: Sequence[KindSummary]) -> None:
     """Nominal against observed coverage of all forecast frames, a panel for each kind."""
     figure, panels = _draw_curves(
-        summaries,
-        "pooled_coverage",
-        100 * np.array(LEVELS),
+        *(summaries, "pooled_coverage", 100 * np.array(LEVELS)),
         legend_room=1.1,
         has_curve=lambda row: row.has_intervals,
         has_band=lambda row, best: True,
@@ -122,10 +113,7 @@ def draw_calibration(path: Path, summaries: Sequence[KindSummary]) -> None:
     )
     for axes in panels:
         axes.plot([0, 100], [0, 100], color="black", lw=0.8)
-        axes.set_xlim(0, 100)
-        axes.set_ylim(0, 100)
-        axes.set_box_aspect(1)
-        axes.set_xlabel("nominal coverage, %")
+        axes.set(xlim=(0, 100), ylim=(0, 100), box_aspect=1, xlabel="nominal coverage, %")
     panels[0].set_ylabel("observed coverage, %")
     _save_png(figure, path)
 
@@ -135,12 +123,7 @@ def draw_forecast(
 ) -> None:
     """A column for each frame; truth, truth with landmarks, forecast, forecast with landmarks.
 
-    Args:
-        path: file to write.
-        title: above all.
-        first_frame: number of the first forecast frame.
-        truth: of one sequence, images included.
-        forecast: of the same.
+    Both have one sequence with images; ``first_frame`` is the number of the first forecast frame.
     """
     count = truth.landmarks.shape[1]
     # squares of known size: a layout that looks for the best takes seconds for twenty of them
@@ -148,26 +131,19 @@ def draw_forecast(
     figure = new_matplotlib_figure(width, height, layout=None)
     figure.suptitle(title, y=1 - 0.1 / height, va="top")
     grid = figure.subplots(4, count, squeeze=False)
-    figure.subplots_adjust(
-        left=_LEFT / width,
-        bottom=_EDGE / height,
-        right=1 - _EDGE / width,
-        top=1 - _TOP / height,
-        wspace=_GAP,
-        hspace=_GAP,
-    )
+    # left, bottom, right, top
+    edges = (_LEFT / width, _EDGE / height, 1 - _EDGE / width, 1 - _TOP / height)
+    figure.subplots_adjust(*edges, wspace=_GAP, hspace=_GAP)
     for number, line in enumerate(grid):
         label, item = ("truth", truth) if number < 2 else ("forecast", forecast)
         has_landmarks = number % 2 == 1
         assert item.images is not None
         for column, axes in enumerate(line):
             axes.imshow(item.images[0, column], extent=(0, 1, 1, 0), interpolation="nearest")
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.set(xticks=[], yticks=[])
             if has_landmarks:
                 _draw_landmarks(axes, item.landmarks[0, column])
-            axes.set_xlim(0, 1)
-            axes.set_ylim(1, 0)
+            axes.set(xlim=(0, 1), ylim=(1, 0))
         line[0].set_ylabel(f"{label}, landmarks" if has_landmarks else label)
     for frame, axes in enumerate(grid[0], start=first_frame):
         axes.set_title(f"frame {frame}")
@@ -223,8 +199,8 @@ def _draw_curves(
 
 def _draw_landmarks(axes: Any, landmarks: NDArray[np.floating]) -> None:
     if not np.isfinite(landmarks).all():
-        axes.text(0.5, 0.5, "no face found", ha="center", va="center", color="white",
-                  bbox={"facecolor": "black", "alpha": 0.6})  # fmt: skip
+        box = {"facecolor": "black", "alpha": 0.6}
+        axes.text(0.5, 0.5, "no face found", ha="center", va="center", color="white", bbox=box)
         return
     is_mouth = np.zeros(len(landmarks), dtype=bool)
     is_mouth[list(LIPS)] = True

@@ -29,15 +29,7 @@ from robo_manip_baselines.runs.versions import software_versions
 
 PERSISTENCE = "persistence"
 """The baseline that skill is measured against; its images are copies of the last one."""
-PACKAGES = [
-    "numpy",
-    "scipy",
-    "scikit-image",
-    "torch",
-    "mediapipe",
-    "opencv-python-headless",
-    "h5py",
-]
+DEPENDS = ("numpy", "scipy", "scikit-image", "torch", "mediapipe", "opencv-python-headless", "h5py")
 """Packages that the numbers may depend on."""
 
 
@@ -253,7 +245,7 @@ def provenance(
 ) -> dict[str, Any]:
     """The part of ``results.json`` that names dataset, checkpoints, options and versions."""
     versions = software_versions()
-    for name in PACKAGES:
+    for name in DEPENDS:
         with suppress(PackageNotFoundError):  # some are needed by some predictors only
             versions |= software_versions(name)
     return {

@@ -227,9 +227,7 @@ def _numbers(
     return result
 
 
-def weighted_mean(
-    values: NDArray[np.floating], weight: Floats, frames: int | None = None
-) -> Floats:
+def weighted_mean(values: Floats, weight: Floats, frames: int | None = None) -> Floats:
     """Weighted mean of (N, ...) over sequences, and axis ``frames`` if given; without NaN."""
     total, count = _sums(values, ~np.isnan(values), weight, frames)
     return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
