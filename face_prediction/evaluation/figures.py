@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
 from face_prediction.evaluation.scoring import LEVELS, EvaluationScores
 from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
-from face_prediction.evaluation.statistics import KindSummary, RowSummary
+from face_prediction.evaluation.statistics import KindSummary
 from face_prediction.prediction.errors import mouth_distances
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.geometry import LIPS
@@ -88,12 +88,7 @@ def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
     Bands are 95 % intervals, of the networks and the best baseline.
     """
     ahead = np.arange(1, summaries[0].horizon + 1)
-    figure, panels = _draw_curves(
-        *(summaries, "distance", ahead),
-        legend_room=1.0,
-        has_curve=lambda row: True,
-        has_band=lambda row, best: row.role == "network" or row.name == best,
-    )
+    figure, panels = _draw_curves(summaries, "distance", ahead)
     for axes in panels:
         axes.set_xticks(ahead)
         axes.set_ylim(bottom=0)
@@ -104,13 +99,8 @@ def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
 
 def draw_calibration(path: Path, summaries: Sequence[KindSummary]) -> None:
     """Nominal against observed coverage of all forecast frames, a panel for each kind."""
-    figure, panels = _draw_curves(
-        *(summaries, "pooled_coverage", 100 * np.array(LEVELS)),
-        legend_room=1.1,
-        has_curve=lambda row: row.has_intervals,
-        has_band=lambda row, best: True,
-        factor=100.0,
-    )
+    percent = 100 * np.array(LEVELS)
+    figure, panels = _draw_curves(summaries, "pooled_coverage", percent, is_coverage=True)
     for axes in panels:
         axes.plot([0, 100], [0, 100], color="black", lw=0.8)
         axes.set(xlim=(0, 100), ylim=(0, 100), box_aspect=1, xlabel="nominal coverage, %")
@@ -155,15 +145,14 @@ def _draw_curves(
     key: str,
     x: NDArray[np.number],
     *,
-    legend_room: float,
-    has_curve: Callable[[RowSummary], bool],
-    has_band: Callable[[RowSummary, str], bool],
-    factor: float = 1.0,
+    is_coverage: bool = False,
 ) -> tuple[Any, Sequence[Any]]:
     """A figure with a panel for each kind: curves of the numbers ``key``, with their intervals.
 
-    Networks are in colour, baselines grey, the best of them black.
+    Networks are in colour, baselines grey, the best of them black. Coverage is in percent, of rows
+    with intervals only, and all of these have bands.
     """
+    legend_room, factor = (1.1, 100.0) if is_coverage else (1.0, 1.0)
     figure = new_matplotlib_figure(_PANEL[0] * len(summaries), _PANEL[1] + legend_room)
     panels = figure.subplots(1, len(summaries), squeeze=False)[0]
     handles: dict[str, Any] = {}
@@ -184,12 +173,12 @@ def _draw_curves(
                 mark = MARKS[others % len(MARKS)]
                 style = {"color": colour, "lw": 1.2, "ls": "--", "marker": mark, "ms": 5}
                 others += 1
-            if not has_curve(row):
+            if is_coverage and not row.has_intervals:
                 continue
             value, low, high = (factor * v[i] for v in (number.value, number.low, number.high))
             (line,) = axes.plot(x, value, **style)
             handles.setdefault(row.name, line)
-            if has_band(row, summary.best_baseline):
+            if is_coverage or row.role == "network" or row.name == summary.best_baseline:
                 axes.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
     columns = min(4, 2 * len(summaries))  # more would be wider than one panel
     place = {"loc": "outside lower center", "ncols": columns, "fontsize": "small"}

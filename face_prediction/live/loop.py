@@ -40,9 +40,8 @@ class LiveStatistics:
         for stage, seconds in self.seconds.items():
             if seconds:
                 mean, high = 1e3 * np.mean(seconds), 1e3 * np.quantile(seconds, 0.95)
-                lines.append(
-                    f"| {stage} | {len(seconds)} | {mean:.1f} | {high:.1f} | {1e3 / mean:.1f} |"
-                )
+                times = f"{mean:.1f} | {high:.1f} | {1e3 / mean:.1f}"
+                lines.append(f"| {stage} | {len(seconds)} | {times} |")
         return "\n".join(lines)
 
 
@@ -58,17 +57,10 @@ def run_loop(
 ) -> None:
     """Find, forecast, draw and show, until there are no more frames or the user has seen enough.
 
-    Args:
-        frames: images with their times.
-        find: the detector.
-        predictor: in its first state.
-        show: takes the drawn images.
-        name: of the predictor, for the screen.
-        history: frames of a whole history.
-        statistics: is filled.
-        clock: seconds.
+    The predictor, whose ``name`` is on the screen, is in its first state; ``history`` is the number
+    of frames of a whole history; ``statistics`` are filled.
     """
-    last: float | None = None
+    last = None
     for frame in frames:
         begun = clock()
         landmarks = find(frame.image, frame.time)

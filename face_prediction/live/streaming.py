@@ -122,24 +122,15 @@ class NetworkForecaster:
         features: list[torch.Tensor],
         last_image: NDArray[np.uint8],
     ) -> NDArray[np.float32]:
-        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features.
-
-        Raises:
-            RequestError: the network forecasts no landmarks.
-        """
+        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features."""
         import torch
 
         with torch.inference_mode():
-            ahead = self._network.decode(
-                self._tensor(landmarks[-self._network.history :]),
-                torch.cat(features, dim=1),
-                self._tensor(last_image),
-                make_images=False,
-            ).landmarks
+            seen = self._tensor(landmarks[-self._network.history :])
+            joined, last = torch.cat(features, dim=1), self._tensor(last_image)
+            ahead = self._network.decode(seen, joined, last, make_images=False).landmarks
         if ahead is None:
-            raise RequestError(
-                f"{self._name}: forecasts images and no landmarks; use another network"
-            )
+            raise RequestError(f"{self._name}: forecasts images and no landmarks; use another")
         return ahead[0].float().cpu().numpy()
 
     def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
@@ -206,15 +197,13 @@ class StreamingPredictor:
     def __init__(
         self, forecaster: LandmarkForecaster | NetworkForecaster, settings: SequenceSettings
     ) -> None:
-        self._forecaster = forecaster
-        self._settings = settings
-        self._frames: deque[_Frame] = deque()
-        self._crop: Crop | None = None
+        self._forecaster, self._settings = forecaster, settings
+        self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
-        self._frames.clear()
-        self._crop = None
+        self._frames: deque[_Frame] = deque()
+        self._crop: Crop | None = None
 
     def update(
         self, time: float, landmarks: NDArray[np.floating] | None, image: NDArray[np.uint8]
@@ -229,11 +218,11 @@ class StreamingPredictor:
         Raises:
             ValueError: the time is not later.
         """
-        frames = self._frames
-        if frames and time <= frames[-1].time:
-            raise ValueError(f"a frame at {time} s after one at {frames[-1].time} s")
-        if frames and time - frames[-1].time > MAX_GAP + SAME_TIME:
+        if self._frames and time <= self._frames[-1].time:
+            raise ValueError(f"a frame at {time} s after one at {self._frames[-1].time} s")
+        if self._frames and time - self._frames[-1].time > MAX_GAP + SAME_TIME:
             self.reset()
+        frames = self._frames
         if landmarks is None:
             return None
         needs = self._forecaster.needs
@@ -256,12 +245,8 @@ class StreamingPredictor:
             for frame in frames:  # too old to be looked at again, whatever the crop will be
                 if frame.time < wanted[-needs.frames] - MAX_GAP - SAME_TIME:
                     frame.image = frame.cut = None
-        return LiveForecast(
-            landmarks=image_points(crop, ahead, size),
-            crop=crop,
-            is_new_crop=is_new,
-            known=int(np.sum(wanted >= times[0] - SAME_TIME)),
-        )
+        known = int(np.sum(wanted >= times[0] - SAME_TIME))
+        return LiveForecast(image_points(crop, ahead, size), crop, is_new, known)
 
     def _lay_crop(self, oldest: float, size: tuple[int, int]) -> tuple[Crop, bool]:
         """The old crop, or one around the faces since ``oldest``; whether it is new."""

@@ -265,10 +265,10 @@ class CrossAttentionModel(FusionModel):
 
     def __init__(self, settings: CrossAttentionSettings) -> None:
         super().__init__(settings)
-        widths = {"landmark": settings.landmark_width, "image": settings.width}
-        self.attention = CrossAttention(*widths.values(), settings.attention_width)
-        self.join = nn.Linear(settings.attention_width, settings.width)
-        for name, width in widths.items():
+        d = settings.attention_width
+        self.attention = CrossAttention(settings.landmark_width, settings.width, d)
+        self.join = nn.Linear(d, settings.width)
+        for name, width in (("landmark", settings.landmark_width), ("image", settings.width)):
             positions = sinusoids(settings.history, width)
             self.register_buffer(f"{name}_positions", positions, persistent=False)
 

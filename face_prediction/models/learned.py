@@ -115,17 +115,18 @@ class LearnedPredictor:
         images = self._checked_images(images, len(landmarks))
         device = next(self.model.parameters()).device
         batches: list[dict[str, NDArray[Any]]] = []
+        freedom = None
         for first in range(0, len(landmarks), self._batch_size):
             rows = slice(first, first + self._batch_size)
             seen = torch.tensor(landmarks[rows], dtype=torch.float32, device=device)
             with torch.inference_mode():
                 output = self.model(History(seen, torch.tensor(images[rows], device=device)))
             batches.append(_arrays(output, horizon))
+            freedom = output.degrees_of_freedom
         joined = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
         if "landmarks" not in joined:
             shape = (len(landmarks), horizon, NUM_LANDMARKS, 2)
             joined["landmarks"] = np.full(shape, np.nan, dtype=np.float32)
-        freedom = output.degrees_of_freedom
         if freedom is not None:
             joined["degrees_of_freedom"] = freedom[:horizon].double().cpu().numpy()
         return Forecast(**joined)

@@ -389,12 +389,7 @@ class PredictorTrainer:
                     log.write("train", progress.step, numbers)
                     bar.report(numbers["loss"])
                 if self._validation and bar.is_due(settings.validate_every):
-                    numbers = held_out_errors(
-                        self._average or model,
-                        self._validation,
-                        settings.batch_size,
-                        self._autocast,
-                    )
+                    numbers = self._validate(self._validation)
                     log.write("validation", progress.step, numbers)
                     self._keep_best(numbers)
                 if bar.is_due(options.checkpoint_every) or is_stopping:
@@ -435,6 +430,32 @@ class PredictorTrainer:
         for mean, new in zip(self._average.buffers(), self._model.buffers(), strict=True):
             mean.copy_(new)
 
+    def _validate(self, windows: SequenceWindows) -> dict[str, float]:
+        """Return means over the sequences of the held-out fold, each at the end of its history.
+
+        ``loss`` and its terms; ``mouth_error``, the distance of the mouth centre in crops over all
+        predicted frames (of a network that predicts landmarks), and beside it
+        ``persistence_mouth_error``, that of predicting no motion; ``copy_image``, the squared error
+        of the last image as a prediction.
+        """
+        model = (self._average or self._model).eval()
+        sums: dict[str, list[float]] = {}
+        for first in range(0, len(windows), self._settings.batch_size):
+            rows = np.arange(first, min(first + self._settings.batch_size, len(windows)))
+            batch = windows.batch(rows, np.full(len(rows), windows.validation_start))
+            with torch.inference_mode(), self._autocast:
+                moved = batch.to(self._device)
+                losses = model.loss(*moved)
+                numbers = {"loss": float(losses.total)}
+                numbers |= {name: float(value) for name, value in losses.terms.items()}
+                numbers |= _mouth_errors(batch, model(moved.history).landmarks)
+            if batch.history.images.shape[1]:
+                change = (batch.future.images.float() - batch.history.images[:, -1:].float()) / 255
+                numbers["copy_image"] = float(change.square().mean())
+            for name, value in numbers.items():
+                sums.setdefault(name, []).append(len(rows) * value)
+        return {name: math.fsum(values) / len(windows) for name, values in sums.items()}
+
     def _keep_best(self, numbers: dict[str, float]) -> None:
         error = _selection_error(numbers)
         self._require_finite(error)
@@ -471,45 +492,14 @@ class PredictorTrainer:
             )
 
 
-def held_out_errors(
-    model: PredictorModel,
-    windows: SequenceWindows,
-    settings: PredictorTrainSettings,
-    autocast: torch.autocast,
-) -> dict[str, float]:
-    """Return means over the sequences of the held-out fold, each at the end of its history.
-
-    ``loss`` and its terms; ``mouth_error``, the distance of the mouth centre in crops over all
-    predicted frames (of a network that predicts landmarks), and beside it
-    ``persistence_mouth_error``, that of predicting no motion; ``copy_image``, the squared error of
-    the last image as a prediction.
-    """
-    model.eval()
-    sums: dict[str, list[float]] = {}
-    for first in range(0, len(windows), settings.batch_size):
-        rows = np.arange(first, min(first + settings.batch_size, len(windows)))
-        batch = windows.batch(rows, np.full(len(rows), windows.validation_start))
-        with torch.inference_mode(), autocast:
-            numbers = _batch_errors(model, batch)
-        for name, value in numbers.items():
-            sums.setdefault(name, []).append(len(rows) * value)
-    return {name: math.fsum(values) / len(windows) for name, values in sums.items()}
-
-
-def _batch_errors(model: PredictorModel, batch: WindowBatch) -> dict[str, float]:
-    moved = batch.to(next(model.parameters()).device)
-    losses = model.loss(*moved)
-    numbers = {name: float(value) for name, value in {"loss": losses.total, **losses.terms}.items()}
-    history, future = batch
-    still = history.landmarks[:, -1:].expand_as(future.landmarks)
-    predictions = {"mouth_error": model(moved.history).landmarks, "persistence_mouth_error": still}
-    for name, landmarks in predictions.items():
+def _mouth_errors(batch: WindowBatch, predicted: Tensor | None) -> dict[str, float]:
+    truth = batch.future.landmarks
+    still = batch.history.landmarks[:, -1:].expand_as(truth)
+    numbers = {}
+    for name, landmarks in (("mouth_error", predicted), ("persistence_mouth_error", still)):
         if landmarks is not None:
-            forecast, truth = landmarks.float().cpu().numpy(), future.landmarks.numpy()
-            numbers[name] = float(mouth_distances(mouth_residuals(forecast, truth)).mean())
-    if history.images.shape[1]:
-        change = (future.images.float() - history.images[:, -1:].float()) / 255
-        numbers["copy_image"] = float(change.square().mean())
+            residuals = mouth_residuals(landmarks.float().cpu().numpy(), truth.numpy())
+            numbers[name] = float(mouth_distances(residuals).mean())
     return numbers
 
 
