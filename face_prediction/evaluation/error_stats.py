@@ -30,8 +30,7 @@ EQUATIONS = (
 )
 """Equations 6 and 7 of the paper, as `Camera.metres` computes them and as every file holds them."""
 QUANTILE_LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
-MAX_LAG = 10
-"""Strides that the autocorrelation is measured over, where a clip is long enough."""
+MAX_LAG = 10  # strides that the autocorrelation is measured over, where a clip is long enough
 _DECIMALS = 6  # of residuals in a run: a millionth of a crop, finer than any detector
 _TOLERANCE = 1e-6  # relative agreement asked of numbers that follow from others in the file
 

@@ -26,10 +26,8 @@ from robo_manip_baselines.runs.files import atomic_file
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of networks, which colour-blind readers can tell apart (Okabe and Ito)."""
 GREY = "#888888"
-MARKS = ("o", "s", "^", "D", "v", "x", "+", "*")
-"""Marks that tell the baselines apart, which are grey."""
-MOUTH_COLOUR, OTHER_COLOUR = "#00E000", "white"
-"""Colours of the mouth's landmarks, and of the others (paper, section IV.B)."""
+MARKS = ("o", "s", "^", "D", "v", "x", "+", "*")  # tell the baselines apart, which are grey
+MOUTH_COLOUR, OTHER_COLOUR = "#00E000", "white"  # of landmarks (paper, section IV.B)
 _LIVELIER_THAN = 0.9  # share of a kind that moves less than the sequence in the figures
 _PANEL = (4.2, 3.6)  # inches
 # inches from one image to the next, and to the left, above and on the other sides of all

@@ -31,18 +31,14 @@ DETECTOR_SIDE = 256
 """Images are enlarged to at least this side (pixels), the one that the detector's second network
 works at: what it does itself with a small image loses more (the mouth of 64-pixel crops is found
 within 0.002 of a crop instead of 0.006)."""
-_IMAGE_BYTES = 64 << 20
-"""Bytes of images that are given to a predictor at once."""
-_LANDMARK_BATCH = 64
-"""Histories at once where there are no images."""
+_IMAGE_BYTES = 64 << 20  # of images that are given to a predictor at once
+_LANDMARK_BATCH = 64  # histories at once where there are no images
 
 
 class BaselinePredictor:
     """Forecasts landmarks as ``forecaster`` does, and images as copies of the last one.
 
-    Args:
-        forecaster: a fitted baseline.
-        image_size: side of the images that are copied; 0: it makes none.
+    ``image_size`` is the side of the images; 0: it makes none.
     """
 
     def __init__(self, forecaster: Forecaster, image_size: int = 0) -> None:
@@ -52,11 +48,7 @@ class BaselinePredictor:
     def predict(
         self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
-        """Forecast ``horizon`` frames; see `Predictor`.
-
-        Raises:
-            RequestError: a shape is another one, or the horizon is 0 or less.
-        """
+        """Forecast ``horizon`` frames; see `Predictor`."""
         if landmarks.ndim != 4:
             raise RequestError(f"landmarks of shape {landmarks.shape}; expected (B, T, 468, 2)")
         forecast = self.forecaster.predict(landmarks, horizon).astype(np.float32, copy=False)
@@ -110,11 +102,9 @@ def find_landmarks(images: NDArray[np.uint8], detector: FaceDetector) -> NDArray
 
 @dataclass(frozen=True)
 class FittedPredictor:
-    """A predictor, and everyone whose footage shaped it.
+    """A predictor, and the ``subjects`` whose footage shaped it.
 
     Attributes:
-        predictor: forecasts.
-        subjects: people that it was fitted to.
         folder: of a trained network.
         checkpoint: of a trained network, as in ``results.json``: folder, name, preset, test fold,
             number of subjects, SHA-256 of the weights.

@@ -54,8 +54,7 @@ PER_FRAME: tuple[tuple[str, str, tuple[Any, ...], Format], ...] = (
     ("SSIM", "ssim", (), _ssim),
 )
 """Metrics of Table II: heading, key of `KindSummary.numbers`, axis U or V, format."""
-TABULATED_LEVELS = (0.5, 0.9)
-"""Nominal coverages in the tables."""
+TABULATED_LEVELS = (0.5, 0.9)  # nominal coverages
 INTRODUCTION = """Everybody is forecast by predictors that never saw the person. Errors are of the
 mouth centre (mean of the lip landmarks), as shares of the crop; a frame without a forecast is
 missing and enters no mean. In brackets: 95 % intervals from resampling people, and sequences within

@@ -35,22 +35,14 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-LEAD = 20
-"""Frames before the first forecast, so that it does not come at once."""
-LONGEST = 6.0
-"""Seconds of a clip in the video, at most."""
-SLOWED = 3
-"""Seconds that a second of footage takes, so that five frames can be followed by eye."""
-PAUSE = 6
-"""Images for which a new forecast stands still, unless there is one at almost every frame."""
-SIZE = (1280, 560)
-"""Pixels of the video: width and height, both even."""
-VIEW = 0.55
-"""Share of the crop that the image of the face covers, around the mouth."""
-TRUTH, TRUTH_ON_IMAGE = (0, 0, 0), (255, 255, 255)
-"""Colours of the truth in the plots, and on the image of the face."""
-FORECASTS = ((230, 90, 0), (0, 114, 178))
-"""Colours of the forecasts: orange and blue."""
+LEAD = 20  # frames before the first forecast, so that it does not come at once
+LONGEST = 6.0  # seconds of a clip in the video, at most
+SLOWED = 3  # seconds that a second of footage takes, so that five frames can be followed by eye
+PAUSE = 6  # images for which a forecast stands still, unless there is one at almost every frame
+SIZE = (1280, 560)  # pixels of the video: width and height, both even
+VIEW = 0.55  # share of the crop that the image of the face covers, around the mouth
+TRUTH, TRUTH_ON_IMAGE = (0, 0, 0), (255, 255, 255)  # in the plots, and on the image of the face
+FORECASTS = ((230, 90, 0), (0, 114, 178))  # orange and blue
 _CLOCK = 90_000  # ticks a second of the times in a file, as cameras and broadcasts have it
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 

@@ -22,11 +22,9 @@ from robo_manip_baselines.runs.errors import RequestError
 
 TITLE = "face-prediction live"
 WHITE: Colour = (255, 255, 255)
-GREEN: Colour = (80, 230, 110)
-"""Of the mouth now, and of the lips."""
-NEAR: Colour = (255, 225, 60)
-FAR: Colour = (255, 60, 40)
-"""Of the mouth in the nearest and in the farthest frame that is forecast."""
+GREEN: Colour = (80, 230, 110)  # the mouth now, and the lips
+NEAR: Colour = (255, 225, 60)  # the mouth in the nearest frame that is forecast
+FAR: Colour = (255, 60, 40)  # and in the farthest
 INSET = 0.34
 """Side of the magnified mouth as a share of the image's shorter side."""
 _ESCAPE = 27
@@ -88,13 +86,9 @@ def draw_mouth(
 ) -> None:
     """Draw the lips and the mouth centre now, and the forecast centres, onto ``image``.
 
+    Landmarks (L, 2 or 3) are those now, and (H, L, 2) ``ahead``, in normalised image coordinates.
     At the lower right the mouth is magnified, with the same drawn in: five frames are soon over,
     and a mouth goes a few pixels in them.
-
-    Args:
-        image: is drawn on.
-        landmarks: (L, 2 or 3) now, normalised image coordinates.
-        ahead: (H, L, 2) forecast, in the same.
     """
     import cv2
 
@@ -107,9 +101,8 @@ def draw_mouth(
     side = int(INSET * size.min())
     inset = Crop(left, top, window).cut(image, side)
     _draw_path(image, lips, path, max(1.5, 0.012 * face))
-    scale = side / window
-    corner = np.array([left, top])
-    _draw_path(inset, (lips - corner) * scale, (path - corner) * scale, max(2.0, 0.012 * side))
+    larger = [(points - np.array([left, top])) * (side / window) for points in (lips, path)]
+    _draw_path(inset, *larger, max(2.0, 0.012 * side))
     cv2.rectangle(inset, (0, 0), (side - 1, side - 1), WHITE, 1)
     image[-side:, -side:] = inset
 
@@ -124,8 +117,7 @@ def draw_text(image: NDArray[np.uint8], lines: Sequence[tuple[str, Colour]]) -> 
     widest = max(cv2.getTextSize(text, _FONT, scale, 1)[0][0] for text, _ in lines)
     room = image.shape[1] - round(30 * scale)
     if widest > room > 0:
-        scale *= room / widest
-        widest = room
+        scale, widest = scale * (room / widest), room
     step = round(30 * scale)
     ground = image[: step * len(lines) + step // 2, : widest + step]
     ground[:] = (ground * 0.45).astype(np.uint8)

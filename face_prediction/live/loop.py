@@ -13,8 +13,7 @@ from face_prediction.live.sources import FindFace
 from face_prediction.live.streaming import LiveForecast, StreamingPredictor
 from face_prediction.tracking.video import VideoFrame
 
-RECENT = 30
-"""Frames that the rates on the screen are averaged over."""
+RECENT = 30  # frames that the rates on the screen are averaged over
 STAGES = ("detector", "predictor", "whole")
 
 

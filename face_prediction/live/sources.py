@@ -22,8 +22,7 @@ from robo_manip_baselines.runs.errors import RequestError
 if TYPE_CHECKING:
     from cv2 import VideoCapture
 
-CAMERA_TIMEOUT = 5.0
-"""Seconds that a camera may take to give an image before it counts as gone."""
+CAMERA_TIMEOUT = 5.0  # s that a camera may take to give an image before it counts as gone
 
 FindFace = Callable[[NDArray[np.uint8], float], NDArray[np.floating] | None]
 

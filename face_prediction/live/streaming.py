@@ -43,12 +43,9 @@ def times_back(now: float, count: int, fps: float) -> NDArray[np.float64]:
 def landmarks_at(
     wanted: NDArray[np.float64], times: NDArray[np.float64], landmarks: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Landmarks (T, L, C) at ``wanted`` (T,), none later than the last of ``times``.
+    """Landmarks (T, L, C) at ``wanted`` (T,) s, of those (N, L, C) at increasing ``times`` (N,) s.
 
-    Args:
-        wanted: s; a time less than a millisecond from a frame's is that frame's.
-        times: (N,) s, increasing.
-        landmarks: (N, L, C).
+    None is wanted after the last; a time less than a millisecond from a frame's is that frame's.
     """
     after = np.clip(np.searchsorted(times, wanted - SAME_TIME), 0, len(times) - 1)
     before = np.maximum(after - 1, 0)
@@ -85,15 +82,7 @@ class LandmarkForecaster:
 
 
 class NetworkForecaster:
-    """Features and forecasts of one network, in eval mode; each image is encoded once.
-
-    Args:
-        network: on its device.
-        name: in messages.
-
-    Attributes:
-        needs: images that it looks at.
-        span: K.
+    """Features and forecasts of one network on its device; each image is encoded once.
 
     Raises:
         RequestError: the network forecasts no landmarks.
@@ -149,8 +138,7 @@ class _Frame:
         landmarks: (L, 3) normalised image coordinates.
         box: (2, 2) least and largest x, y of them.
         image: None where nobody looks at it, or not any more.
-        cut: (S, S, 3) of it at the present crop, once it was needed.
-        features: of the network at the present crop, once they were needed.
+        cut: (S, S, 3) of it at the present crop, once needed, and ``features`` of the network.
     """
 
     time: float
@@ -189,9 +177,7 @@ class StreamingPredictor:
     A face that is gone for more than `MAX_GAP` seconds is forgotten, with its history. Between
     frames further apart than that nothing is known either.
 
-    Args:
-        forecaster: makes the forecasts.
-        settings: of the sequences that it was trained on: history, rate, margin, images.
+    Settings are of the sequences that the forecaster was trained on: history, rate, margin, images.
     """
 
     def __init__(

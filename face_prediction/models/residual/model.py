@@ -46,17 +46,14 @@ _LEAST_FREEDOM = 2.0
 _FREEDOM_START = math.log(math.expm1(3.0))
 
 # Warp
-FLOW_CELLS = 32
-"""G, fine enough for a jaw."""
-FLOW_REACH = 0.05
-"""Standard deviation in crops of the Gaussian with which landmarks move the cells around them."""
-BACKGROUND = 0.3
-"""Weight of the background, which stays, beside the landmarks'."""
+FLOW_CELLS = 32  # G, fine enough for a jaw
+FLOW_REACH = 0.05  # crops, standard deviation of the Gaussian that moves cells around landmarks
+BACKGROUND = 0.3  # weight of the background, which stays, beside the landmarks'
 
 # Training
+# Frames between the origins of a sequence that are trained on. The last is at its end; the first
+# has as many frames before it as the network sees.
 ORIGIN_STEP = 3
-"""Frames between the origins of a sequence that are trained on. The last is at its end; the first
-has as many frames before it as the network sees."""
 # crops, counts 1 in the loss: the best baselines' (docs/predictor_evaluation.md)
 _USUAL_ERROR = 0.01
 

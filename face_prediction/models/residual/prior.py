@@ -35,17 +35,14 @@ _WARM_UP = 16  # frames at the beginning of a sequence that are left out: they h
 _STILL = 1e-3  # crops: a sequence with this mean step of the mouth counts half
 
 # Adaptation to one face
-PERIOD = 6
-"""Frames of 30 a second after which the pattern of video of 25 repeats."""
-OTHER_PHASES = 0.1
-"""Weight of frames at another phase of the pattern, for a periodic expert."""
+PERIOD = 6  # frames of 30 a second after which the pattern of video of 25 repeats
+OTHER_PHASES = 0.1  # weight of frames at another phase of the pattern, for a periodic expert
 _REST = 1e-6  # least mean square of scaled features: a face at rest must not divide by 0
 
 # Mixture
-WINDOW = 40
-"""Origins whose errors decide an expert's weight."""
+WINDOW = 40  # origins whose errors decide an expert's weight
+# an expert whose errors are 1 + d times the best one's has exp(-SHARPNESS d) times its weight
 SHARPNESS = 15.0
-"""An expert whose errors are 1 + d times the best one's has exp(-SHARPNESS d) times its weight."""
 _WINDOW_OTHER_PHASES = 0.2  # weight of origins at another phase of the pattern
 _ALIKE = 1e-5  # crops, added to errors before they are compared: a hundredth of a pixel of 256
 _LEAST_ERROR = 2e-4  # crops: below the detector's jitter (0.0004 and more)
