@@ -43,8 +43,7 @@ class Camera:
     ``crop_width`` and ``crop_height`` say how large the crop is in that camera's image.
 
     Attributes:
-        fov_x_deg: degrees across: the webcam of section IV.C.
-        fov_y_deg: degrees up.
+        fov_x_deg: degrees across, and ``fov_y_deg`` up: the webcam of section IV.C.
         depth_m: metres from the camera to the mouth (section IV.C).
         crop_width: the crop's side as a share of the image's width; 1: the crop is the image.
         crop_height: the same of the height.
@@ -92,8 +91,7 @@ class HorizonErrors:
 
     Attributes:
         frames: ahead, 1 is the next.
-        forecasts: number of them.
-        missing: forecasts there should have been.
+        forecasts: number of them, beside the ``missing``.
         mean_abs: mean of the absolute errors.
         var_abs: variance of the absolute errors.
         bias: mean of the signed errors.

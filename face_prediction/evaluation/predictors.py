@@ -61,26 +61,6 @@ class BaselinePredictor:
         return Forecast(forecast, np.repeat(images, horizon, axis=1))
 
 
-class DetectedPredictor:
-    """A predictor of images only, with the landmarks that a detector finds in them.
-
-    Where no face is found the landmarks are NaN: a missing forecast.
-    """
-
-    def __init__(self, predictor: Predictor, detector: FaceDetector) -> None:
-        self.name, self.memory, self.needs = predictor.name, predictor.memory, predictor.needs
-        self._predictor, self._detector = predictor, detector
-
-    def predict(
-        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
-    ) -> Forecast:
-        """Forecast images, and find the face in each; see `Predictor`."""
-        forecast = self._predictor.predict(landmarks, images, horizon)
-        if forecast.images is None:
-            return forecast
-        return replace(forecast, landmarks=find_landmarks(forecast.images, self._detector))
-
-
 def find_landmarks(images: NDArray[np.uint8], detector: FaceDetector) -> NDArray[np.float32]:
     """Landmarks (B, H, L, 2) in images (B, H, S, S, 3), normalised to them; NaN without a face.
 
@@ -125,12 +105,14 @@ class EvaluatedPredictor:
         by_fold: for each fold the one that was fitted without its people.
         role: kind of row in the tables.
         image_size: side of the images that it forecasts; 0: none.
+        detector: finds the landmarks in its images, if it forecasts no others.
     """
 
     name: str
     by_fold: Mapping[int, FittedPredictor]
     role: Role = "network"
     image_size: int = 0
+    detector: FaceDetector | None = None
 
     @property
     def needs(self) -> list[ImageNeeds]:
@@ -170,6 +152,8 @@ class EvaluatedPredictor:
         predictor, *_ = [self.predictor_for(row.fold, row.subject) for row in rows]
         expected = batch.future.shape
         forecast = predictor.predict(batch.history, batch.images(predictor.needs), expected[1])
+        if self.detector is not None and forecast.images is not None:
+            forecast = replace(forecast, landmarks=find_landmarks(forecast.images, self.detector))
         if forecast.landmarks.shape != expected:
             raise RequestError(
                 f"{self.name}: landmarks of shape {forecast.landmarks.shape}; expected {expected}"

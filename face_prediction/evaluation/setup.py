@@ -17,11 +17,9 @@ from face_prediction.dataset.manifest import SequenceRow
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation.predictors import (
     BaselinePredictor,
-    DetectedPredictor,
     EvaluatedPredictor,
     FittedPredictor,
 )
-from face_prediction.prediction.interface import Predictor
 from face_prediction.tracking.detector import FaceDetector
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.seeds import stream_generator
@@ -218,21 +216,16 @@ def prepare_evaluation(
                 without_landmarks.add(predictor.name)
     common_size = sizes[PERSISTENCE] = min(sizes.values(), default=crop_size)
     detector = open_detector() if without_landmarks else None
-
-    def completed(name: str, predictor: Predictor) -> Predictor:
-        if name == PERSISTENCE and isinstance(predictor, BaselinePredictor):
-            return BaselinePredictor(predictor.forecaster, common_size)
-        if name in without_landmarks and detector is not None:
-            return DetectedPredictor(predictor, detector)
-        return predictor
-
     ready: list[EvaluatedPredictor] = []
     for row in predictors:
-        by_fold = {
-            fold: replace(fitted, predictor=completed(row.name, fitted.predictor))
-            for fold, fitted in row.by_fold.items()
-        }
-        ready.append(replace(row, image_size=sizes.get(row.name, 0), by_fold=by_fold))
+        by_fold = dict(row.by_fold)
+        for fold, fitted in by_fold.items():
+            if row.name == PERSISTENCE and isinstance(fitted.predictor, BaselinePredictor):
+                copying = BaselinePredictor(fitted.predictor.forecaster, common_size)
+                by_fold[fold] = replace(fitted, predictor=copying)
+        finder = detector if row.name in without_landmarks else None
+        size = sizes.get(row.name, 0)
+        ready.append(replace(row, by_fold=by_fold, image_size=size, detector=finder))
     largest = max((sizes[name] for name in without_landmarks), default=0)
     return EvaluationSetup(dataset, selection, tuple(ready), common_size, detector, largest)
 

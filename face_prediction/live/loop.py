@@ -195,8 +195,8 @@ def draw_mouth(
     side = int(INSET * size.min())
     inset = Crop(left, top, window).cut(image, side)
     _draw_path(image, lips, path, max(1.5, 0.012 * face))
-    larger = [(points - np.array([left, top])) * (side / window) for points in (lips, path)]
-    _draw_path(inset, *larger, max(2.0, 0.012 * side))
+    corner, scale = np.array([left, top]), side / window
+    _draw_path(inset, (lips - corner) * scale, (path - corner) * scale, max(2.0, 0.012 * side))
     cv2.rectangle(inset, (0, 0), (side - 1, side - 1), WHITE, 1)
     image[-side:, -side:] = inset
 

@@ -159,9 +159,7 @@ class ApproachSettings(ModelSettings):
         size: side of the images in pixels, seen and predicted.
         channels: of the convolutions, each of which halves the image; the decoder has the same in
             reverse.
-        width: of the tokens of the Transformer encoder.
-        heads: of the Transformer encoder.
-        layers: of the Transformer encoder.
+        width: of the tokens of the Transformer encoder, with ``heads`` and ``layers``.
         feedforward: hidden width of its feed-forward networks.
         dropout: in the Transformer encoder.
         history: frames seen.
