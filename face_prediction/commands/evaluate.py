@@ -37,7 +37,7 @@ from face_prediction.evaluation.video import write_forecast_video
 from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import file_digest
+from robo_manip_baselines.runs.files import file_digest, require_out_folder
 
 logger = logging.getLogger(__name__)
 
@@ -159,8 +159,7 @@ def check_evaluate_options(options: EvaluateOptions) -> None:
     model = options.detector_model
     if model is not None and not model.is_file():
         raise RequestError(f"--detector_model {model}: no such file")
-    if options.out.exists() and not options.out.is_dir():
-        raise RequestError(f"--out {options.out}: is a file; name a folder")
+    require_out_folder(options.out)
 
 
 def open_detector(model: Path | None) -> FaceDetector:

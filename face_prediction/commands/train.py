@@ -21,7 +21,6 @@ def run_train(options: FaceTrainOptions) -> int:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        raise RequestError(
-            "training needs PyTorch; pip install 'robo_manip_baselines[face-prediction]'"
-        ) from None
+        install = "pip install 'robo_manip_baselines[face-prediction]'"
+        raise RequestError(f"training needs PyTorch; {install}") from None
     return train_predictor(options)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from face_prediction.dataset.build import track_frames
 from face_prediction.dataset.clip_file import decode_image, encode_image, reduction
 from face_prediction.dataset.sequences import SequenceSettings
-from face_prediction.forecast import mouth_centre
+from face_prediction.forecast.interface import Array, mouth_centre
 from face_prediction.motion.motion import Quality
 from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.geometry import Crop, crop_around, image_points, image_rays
-from face_prediction.tracking.tracks import FaceTrack
+from face_prediction.tracking.tracks import FaceTrack, Size
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Origin:
 
 def find_origins(
     frames: Sequence[int],
-    landmarks: NDArray[np.floating],
-    image_size: tuple[int, int],
+    landmarks: Array,
+    image_size: Size,
     quality: Quality,
     length: int,
     margin: float,
@@ -78,9 +78,7 @@ def find_origins(
     return origins
 
 
-def crop_history(
-    origin: Origin, landmarks: NDArray[np.floating], image_size: tuple[int, int]
-) -> NDArray[np.float32]:
+def crop_history(origin: Origin, landmarks: Array, image_size: Size) -> NDArray[np.float32]:
     """The landmarks (T, L, 2) of a history in its crop."""
     points = origin.crop.normalise(landmarks[origin.history], image_size)
     return points[..., :2].astype(np.float32)
@@ -146,12 +144,7 @@ def history_images(
             cut = {(n, c): kept for (n, c), kept in cut.items() if n >= first and c == crop}
 
 
-def mouth_ahead(
-    mouth: NDArray[np.floating],
-    now: NDArray[np.floating],
-    ahead: NDArray[np.floating],
-    image_size: tuple[int, int],
-) -> NDArray[np.float64]:
+def mouth_ahead(mouth: Array, now: Array, ahead: Array, image_size: Size) -> NDArray[np.float64]:
     """Mouth positions (N, H, 3) in metres from forecasts of the mouth centre in the image.
 
     Args:
@@ -166,11 +159,7 @@ def mouth_ahead(
 
 
 def forecast_metres(
-    origins: Sequence[Origin],
-    forecasts: NDArray[np.floating],
-    landmarks: NDArray[np.floating],
-    mouth: NDArray[np.floating],
-    image_size: tuple[int, int],
+    origins: Sequence[Origin], forecasts: Array, landmarks: Array, mouth: Array, image_size: Size
 ) -> NDArray[np.float64]:
     """Mouth positions (N, H, 3) in metres of forecasts (N, H, L, 2) in crops.
 
@@ -182,23 +171,16 @@ def forecast_metres(
         image_size: (width, height) in pixels.
     """
     frames = [origin.frame for origin in origins]
-    ahead = [
-        image_points(origin.crop, centre, image_size)
-        for origin, centre in zip(origins, mouth_centre(forecasts), strict=True)
-    ]
+    pairs = zip(origins, mouth_centre(forecasts), strict=True)
+    ahead = [image_points(origin.crop, centre, image_size) for origin, centre in pairs]
     return mouth_ahead(mouth[frames], mouth_centre(landmarks[frames]), np.stack(ahead), image_size)
 
 
-def errors_across(
-    predicted: NDArray[np.floating], mouth: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def errors_across(predicted: Array, mouth: Array) -> NDArray[np.float64]:
     """Errors (N, H) in metres across the view of a run's forecasts.
 
-    NaN where the run has ended by then.
-
-    Args:
-        predicted: (N, H, 3) m of the successive frames of one run.
-        mouth: (N, 3) m.
+    ``predicted`` (N, H, 3) m and ``mouth`` (N, 3) m are of the successive frames of one run; NaN
+    where it has ended by then.
     """
     count, horizon = predicted.shape[:2]
     errors = np.full((count, horizon), np.nan)

@@ -219,10 +219,8 @@ class _ClipReader:
             if len(self.start) != clip.sequences or self._index.shape != shape:
                 wrong.append("sequences")
             if wrong:
-                raise RequestError(
-                    f"{path}: its {', '.join(wrong)} are not those of the dataset; "
-                    "make the dataset again"
-                )
+                problem = f"its {', '.join(wrong)} are not those of the dataset"
+                raise RequestError(f"{path}: {problem}; make the dataset again")
         except RequestError:
             self.file.close()
             raise

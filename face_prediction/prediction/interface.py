@@ -64,10 +64,7 @@ class Predictor(Protocol):
         ...
 
     def predict(
-        self,
-        landmarks: NDArray[np.floating],
-        images: NDArray[np.uint8] | None,
-        horizon: int,
+        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
         """Forecast ``horizon`` frames.
 
