@@ -14,8 +14,7 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.evaluation.predictors import BaselinePredictor
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
-from face_prediction.live.display import video_sink, window_sink
-from face_prediction.live.loop import LiveStatistics, run_loop
+from face_prediction.live.loop import LiveStatistics, run_loop, video_sink, window_sink
 from face_prediction.live.sources import face_finder, live_frames
 from face_prediction.live.streaming import LandmarkForecaster, NetworkForecaster, StreamingPredictor
 from face_prediction.tracking.detector import find_model

@@ -17,7 +17,7 @@ def run_train(options: FaceTrainOptions) -> int:
             installed.
     """
     try:
-        from face_prediction.training.setup import train_predictor  # not at the top: loads torch
+        from face_prediction.training.trainer import train_predictor  # not at the top: loads torch
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise

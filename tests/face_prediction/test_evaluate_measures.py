@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,18 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from face_prediction.evaluation.errors import (
+from face_prediction.evaluation.predictors import (
+    DETECTOR_SIDE,
+    BaselinePredictor,
+    EvaluatedPredictor,
+    FittedPredictor,
+    find_landmarks,
+)
+from face_prediction.evaluation.scoring import (
     LEVELS,
     area_average,
     coverage,
     interval_levels,
     similarities,
-)
-from face_prediction.evaluation.predictors import (
-    DETECTOR_SIDE,
-    BaselinePredictor,
-    DetectedPredictor,
-    find_landmarks,
 )
 from face_prediction.forecast.extrapolation import ConstantVelocity, Persistence
 from face_prediction.prediction.interface import Forecast, ImageNeeds
@@ -167,9 +169,12 @@ class Blind:
 def test_a_predictor_of_pictures_gets_the_detectors_landmarks() -> None:
     shown = np.zeros((1, 1, 64, 64, 3), dtype=np.uint8)
     shown[0, 0, 16:24, 8:16] = 255
-    predictor = DetectedPredictor(Blind(), BrightestPixel([]))
-    assert (predictor.name, predictor.memory, predictor.needs) == ("blind", 1, ImageNeeds(1, 64))
-    forecast = predictor.predict(np.zeros((1, 4, 468, 2)), shown, 3)
+    fitted = {0: FittedPredictor(Blind(), frozenset())}
+    predictor = EvaluatedPredictor("blind", fitted, image_size=64, detector=BrightestPixel([]))
+    assert predictor.needs == [ImageNeeds(1, 64)]
+    history, future = np.zeros((1, 4, 468, 2)), np.zeros((1, 3, 468, 2))
+    batch = SimpleNamespace(history=history, future=future, images=lambda needs: shown)
+    forecast = predictor.forecast([SimpleNamespace(fold=0, subject="ann")], batch)
     np.testing.assert_allclose(
         forecast.landmarks[0, :, 5, 0], (12 + 8 * np.arange(1, 4)) / 64, atol=0.005
     )

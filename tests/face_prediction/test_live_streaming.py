@@ -37,7 +37,6 @@ def toy(history: int = 8, pictures: int = 5, span: int = 1, landmarks: bool = Tr
             super().__init__()
             self.history, self.horizon, self.span = history, 5, span
             self.needs = ImageNeeds(pictures, 32)
-            self.makes_images = False
             self.weight = torch.nn.Parameter(torch.tensor(1e-7, dtype=torch.float64))
             self.encoded: list[int] = []
 

@@ -45,7 +45,7 @@ def dataset(tmp_path: Path) -> Path:
 @pytest.fixture
 def trained(tmp_path: Path, dataset: Path) -> Callable[..., Path]:
     """A folder as ``train`` leaves it, of a tiny network with random weights."""
-    from face_prediction.models.checkpoint import CheckpointRecord, save_predictor_checkpoint
+    from face_prediction.models.learned import CheckpointRecord, save_predictor_checkpoint
     from face_prediction.models.settings import make_predictor_model, settings_class
 
     def save(fold: int, model: str = "cross_attention", name: str = "", **changes: Any) -> Path:

@@ -13,9 +13,8 @@ import pytest
 import torch
 
 from face_prediction.commands.train import run_train
-from face_prediction.models.checkpoint import read_tensors, write_tensors
 from face_prediction.models.interface import History
-from face_prediction.models.learned import LearnedPredictor
+from face_prediction.models.learned import LearnedPredictor, read_tensors, write_tensors
 from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long

@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from face_prediction.dataset.manifest import fold_split
 from face_prediction.models.settings import PredictorTrainSettings
 from face_prediction.training.options import FaceTrainOptions
-from face_prediction.training.setup import CURVES, choose_people
-from face_prediction.training.trainer import StepMeans, torch_seed
+from face_prediction.training.trainer import CURVES, StepMeans, choose_people, torch_seed
 from face_prediction.training.windows import SequenceImages, WindowSampler
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.interrupt import StopRequest

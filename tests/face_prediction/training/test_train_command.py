@@ -15,8 +15,7 @@ import torch
 
 from face_prediction.commands.train import run_train
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.models.checkpoint import read_predictor_checkpoint, read_tensors
-from face_prediction.models.learned import LearnedPredictor
+from face_prediction.models.learned import LearnedPredictor, read_predictor_checkpoint, read_tensors
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.training.options import FaceTrainOptions
@@ -140,7 +139,7 @@ def test_help_does_not_load_torch(repository: Path) -> None:
 
 def test_without_torch_it_says_what_to_install(options, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "face_prediction.training.setup")
+    monkeypatch.delitem(sys.modules, "face_prediction.training.trainer")
     with pytest.raises(RequestError, match="pip install"):
         run_train(options)
 
