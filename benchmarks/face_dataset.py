@@ -157,7 +157,7 @@ def main() -> None:
             (f"whole sequence, {side}×{side}", dataset.read),
             (f"whole sequence, {side // 2}×{side // 2}", lambda i: dataset.read(i, reduce=2)),
             (f"whole sequence, {side // 4}×{side // 4}", lambda i: dataset.read(i, reduce=4)),
-            ("the frames to predict", lambda i: dataset.pictures(i, future)),
+            ("the frames to predict", lambda i: dataset.images(i, future)),
             ("landmarks only", dataset.landmarks),
         ]
         print("| what is read | median ms | 95 % ms |\n|---|---|---|")

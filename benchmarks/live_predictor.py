@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.histories import dataset_image
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.evaluation.predictors import BaselinePredictor
 from face_prediction.forecast.extrapolation import Persistence
@@ -94,10 +94,10 @@ def whole(network: PredictorModel, frames: int) -> Taken:
     )
     assert crop is not None
     needs = network.needs
-    shown = [dataset_picture(image, crop.crop, SETTINGS, needs.size) for image in images[:warm]]
+    shown = [dataset_image(image, crop.crop, SETTINGS, needs.size) for image in images[:warm]]
 
     def run(number: int) -> None:
-        shown.append(dataset_picture(images[number], crop.crop, SETTINGS, needs.size))
+        shown.append(dataset_image(images[number], crop.crop, SETTINGS, needs.size))
         points = crop.crop.normalise(landmarks[number - network.history + 1 : number + 1], IMAGE)
         pictures = np.stack(shown[len(shown) - needs.frames :])
         with torch.inference_mode():

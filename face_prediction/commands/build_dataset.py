@@ -33,6 +33,7 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings, kind_of
 from face_prediction.motion.library import Attribution, read_attributions, track_files
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_folder
 
 logger = logging.getLogger(__name__)
 
@@ -130,21 +131,14 @@ def read_rows(tracks: Iterable[Path], table: Path | None) -> dict[str, Attributi
     clips = [path.stem for path in tracks]
     unknown = [clip for clip in clips if clip not in known]
     if unknown:
-        logger.warning(
-            "%d clips have no row in --attribution (%s%s): each counts as a person of its own",
-            len(unknown),
-            ", ".join(unknown[:3]),
-            ", ..." if len(unknown) > 3 else "",
-        )
+        names = ", ".join(unknown[:3] + ["..."] * (len(unknown) > 3))
+        what = "%d clips have no row in --attribution (%s): each counts as a person of its own"
+        logger.warning(what, len(unknown), names)
     return {clip: known.get(clip, Attribution(clip, clip, False)) for clip in clips}
 
 
 def refuse_same_video(entries: Iterable[ClipEntry]) -> None:
-    """Check that nobody can be trained on under one name and reported on under another.
-
-    Raises:
-        RequestError: the same video is there for two people.
-    """
+    """Raise RequestError if one video is of two people: trained on and reported on."""
     seen: dict[str, ClipEntry] = {}
     for entry in entries:
         first = seen.setdefault(entry.video_sha256, entry)
@@ -156,13 +150,8 @@ def refuse_same_video(entries: Iterable[ClipEntry]) -> None:
 
 
 def refuse_other_folder(out: Path) -> None:
-    """Check that ``out`` is new, empty, or a dataset, whole or begun.
-
-    Raises:
-        RequestError: it is a file, or holds something else.
-    """
-    if out.exists() and not out.is_dir():
-        raise RequestError(f"--out {out}: is a file; name a folder")
+    """Raise RequestError unless ``out`` is new, empty, or a dataset, whole or begun."""
+    require_out_folder(out)
     if (out / MANIFEST_NAME).exists():
         try:
             read_manifest(out)
@@ -173,6 +162,5 @@ def refuse_other_folder(out: Path) -> None:
         names = [path.name for path in out.iterdir() if path.name not in ours]
         others = sorted(name for name in names if not name.endswith(".partial"))
         if others:
-            raise RequestError(
-                f"--out {out}: holds {', '.join(others[:3])} and no dataset; name another folder"
-            )
+            content = f"holds {', '.join(others[:3])} and no dataset"
+            raise RequestError(f"--out {out}: {content}; name another folder")

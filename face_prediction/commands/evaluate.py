@@ -37,7 +37,7 @@ from face_prediction.evaluation.video import write_forecast_video
 from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import file_digest
+from robo_manip_baselines.runs.files import file_digest, require_out_folder
 
 logger = logging.getLogger(__name__)
 
@@ -145,11 +145,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
 
 
 def check_evaluate_options(options: EvaluateOptions) -> None:
-    """Check what can be checked before anything is read.
-
-    Raises:
-        RequestError: an option is out of its range.
-    """
+    """Raise RequestError if an option is out of its range, before anything is read."""
     for kind in options.kinds:
         require_choice("kind of footage", kind, KINDS)
     for name, least in (("seed", 0), ("resamples", 1), ("max_sequences", 2)):
@@ -159,8 +155,7 @@ def check_evaluate_options(options: EvaluateOptions) -> None:
     model = options.detector_model
     if model is not None and not model.is_file():
         raise RequestError(f"--detector_model {model}: no such file")
-    if options.out.exists() and not options.out.is_dir():
-        raise RequestError(f"--out {options.out}: is a file; name a folder")
+    require_out_folder(options.out)
 
 
 def open_detector(model: Path | None) -> FaceDetector:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from face_prediction.dataset.clip_file import open_clip, read_array, read_record
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.dataset.manifest import CLIP_FOLDER
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation.error_stats import (
@@ -36,6 +36,7 @@ from face_prediction.motion.library import load_motion
 from face_prediction.prediction.errors import mouth_residuals
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_file
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +96,7 @@ def run_export_stats(options: ExportStatsOptions) -> int:
         RequestError: dataset or predictor cannot be used, or nothing is left to measure.
     """
     camera = Camera(options.fov_x_deg, options.fov_y_deg, options.depth_m)
-    refuse_unrelated_file(options.out)
+    require_out_file(options.out, load_predictor_error_stats)
     if options.max_run_frames is not None and options.max_run_frames < 1:
         raise RequestError(f"--max_run_frames {options.max_run_frames}: 1 or more")
     with FaceDataset(options.dataset) as dataset:
@@ -118,10 +119,8 @@ def run_export_stats(options: ExportStatsOptions) -> int:
     )
     save_predictor_error_stats(options.out, stats)
     logger.info("crops span %.3f m at the mouth (median)", span)
-    logger.info(
-        "%s: %s on %d forecasts of kind %s, %d subjects",
-        *(options.out, stats.predictor, stats.sequences, stats.footage, stats.subjects),
-    )
+    counts = (stats.predictor, stats.sequences, stats.footage, stats.subjects)
+    logger.info("%s: %s on %d forecasts of kind %s, %d subjects", options.out, *counts)
     print(error_stats_table(stats))  # noqa: T201
     return 0
 
@@ -138,10 +137,10 @@ def dataset_residuals(
     settings = dataset.manifest.settings
     truth = np.stack([dataset.landmarks(i)[settings.history :, :, :2] for i in selection.indices])
     forecasts = np.empty_like(truth)
-    plan = ImagePlan.of(predictor.needs)
     with tqdm(total=len(truth), unit="sequence", leave=False, disable=not progress) as bar:
         for places in selection.batches(min(map(batch_size, predictor.needs))):
-            batch = SequenceBatch(dataset, selection.indices[places].tolist(), plan)
+            indices = selection.indices[places].tolist()
+            batch = SequenceBatch(dataset, indices, predictor.needs)
             forecasts[places] = predictor.forecast(selection.rows_at(places), batch).landmarks
             bar.update(len(places))
     return MouthResiduals(
@@ -218,21 +217,6 @@ def median_crop_span(dataset: FaceDataset, clips: Iterable[str]) -> float:
         focal = height / 2 / math.tan(math.radians(VERTICAL_FOV_DEGREES / 2))
         spans.append(side / focal * -mouth[start + last, 2])
     return float(np.median(np.concatenate(spans)))
-
-
-def refuse_unrelated_file(out: Path) -> None:
-    """Check that nothing but an older file of error statistics is lost by writing ``out``.
-
-    Raises:
-        RequestError: it is a folder, or a file of another kind.
-    """
-    if out.is_dir():
-        raise RequestError(f"--out {out}: is a folder; name a file")
-    if out.exists():
-        try:
-            load_predictor_error_stats(out)
-        except RequestError as error:
-            raise RequestError(f"{error}; it is in the way of --out, so remove it first") from None
 
 
 def error_stats_table(stats: PredictorErrorStats) -> str:

@@ -14,20 +14,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from face_prediction.motion.library import (
-    Attribution,
-    attribution_of,
-    read_attributions,
-    track_files,
-)
-from face_prediction.motion.surface import (
-    facing_out,
-    measure,
-    mediapipe_topology,
-    metric_landmarks,
-)
+from face_prediction.motion.library import Attribution, attributed_tracks
+from face_prediction.motion.surface import facing_out, measure, mediapipe_topology, metric_landmarks
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_file
 from robo_manip_baselines.runs.npz import write_npz
 
 logger = logging.getLogger(__name__)
@@ -77,17 +68,12 @@ def run_export_surface(options: ExportSurfaceOptions) -> None:
             left, the mouth never opens, or MediaPipe, which knows the mesh, is not installed.
     """
     if options.max_frames < 1 or options.min_frames < 2:
-        raise RequestError(
-            f"--max_frames {options.max_frames} --min_frames {options.min_frames}: "
-            "at least 1 and 2 are needed"
-        )
-    if options.out.is_dir():
-        raise RequestError(f"--out {options.out}: is a folder; name a file")
-    rows = None if options.attribution is None else read_attributions(options.attribution)
+        given = f"--max_frames {options.max_frames} --min_frames {options.min_frames}"
+        raise RequestError(f"{given}: at least 1 and 2 are needed")
+    require_out_file(options.out)
     clips: list[Attribution] = []
     subjects: dict[str, list[np.ndarray]] = defaultdict(list)  # faces (T, 468, 3) of each clip
-    for path in track_files(options.tracks):
-        row = attribution_of(path, rows, options.attribution)
+    for path, row in attributed_tracks(options.tracks, options.attribution):
         if row.ship:
             faces = measured_faces(path, options.max_frames)
             if len(faces) >= options.min_frames:

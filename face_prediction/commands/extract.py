@@ -15,7 +15,7 @@ from face_prediction.tracking.extract import ExtractSettings, extract_track, is_
 from face_prediction.tracking.tracks import save_track
 from face_prediction.tracking.video import require_video
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import file_digest
+from robo_manip_baselines.runs.files import file_digest, require_out_folder
 
 logger = logging.getLogger(__name__)
 
@@ -94,13 +94,11 @@ def output_paths(videos: Iterable[Path], out: Path) -> list[tuple[Path, Path]]:
     pairs = [(video, out / f"{video.stem}.npz") for video in videos]
     if not pairs:
         raise RequestError("no video given; name one or more video files")
-    if out.exists() and not out.is_dir():
-        raise RequestError(f"--out {out}: is a file; name a folder")
+    require_out_folder(out)
     seen: dict[Path, Path] = {}
     for video, path in pairs:
         if path in seen:
-            raise RequestError(
-                f"{seen[path]} and {video} would both become {path}; extract them to two folders"
-            )
+            two = f"{seen[path]} and {video}"
+            raise RequestError(f"{two} would both become {path}; extract them to two folders")
         seen[path] = video
     return pairs

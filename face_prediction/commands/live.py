@@ -14,14 +14,14 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.evaluation.predictors import BaselinePredictor
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
-from face_prediction.live.display import video_sink, window_sink
-from face_prediction.live.loop import LiveStatistics, run_loop
+from face_prediction.live.loop import LiveStatistics, run_loop, video_sink, window_sink
 from face_prediction.live.sources import face_finder, live_frames
 from face_prediction.live.streaming import LandmarkForecaster, NetworkForecaster, StreamingPredictor
 from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoReader, require_video
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_file
 
 logger = logging.getLogger(__name__)
 
@@ -30,8 +30,6 @@ HORIZON = 5
 SHIPPED = "shipped"
 UNFITTED = ("persistence", "constant_velocity", "line")
 """Baselines without parameters."""
-
-LiveForecaster = LandmarkForecaster | NetworkForecaster
 
 
 @dataclass(frozen=True)
@@ -78,16 +76,15 @@ def run_live(options: LiveOptions) -> int:
     rate = settings.fps
     if options.video is not None:
         with VideoReader(options.video) as reader:
-            rate = reader.info.average_rate or rate
+            rate = reader.average_rate or rate
     statistics = LiveStatistics()
     code = 0
     with ExitStack() as stack:
         sink = window_sink() if options.out is None else video_sink(options.out, rate)
         show = stack.enter_context(sink)
         find = stack.enter_context(face_finder(model))
-        frames = stack.enter_context(
-            closing(live_frames(options.video, options.camera, options.seconds))
-        )
+        frames = live_frames(options.video, options.camera, options.seconds)
+        stack.enter_context(closing(frames))
         predictor = StreamingPredictor(forecaster, settings)
         try:
             run_loop(frames, find, predictor, show, name, settings.history, statistics)
@@ -97,20 +94,14 @@ def run_live(options: LiveOptions) -> int:
             code = 130
     if options.out is not None:
         logger.info("%s: %d frames", options.out, statistics.frames)
-    logger.info(
-        "face in %d of %d frames, crops laid: %d",
-        *(statistics.faces, statistics.frames, statistics.crops),
-    )
+    counts = (statistics.faces, statistics.frames, statistics.crops)
+    logger.info("face in %d of %d frames, crops laid: %d", *counts)
     print(statistics.times_table())  # noqa: T201
     return code
 
 
 def check_live_options(options: LiveOptions) -> None:
-    """Check what can be checked before anything is read.
-
-    Raises:
-        RequestError: an option is out of its range, or the file to write is one that is read.
-    """
+    """Raise RequestError if an option is out of its range, or the file to write is the one read."""
     out, video = options.out, options.video
     if (options.camera is None) == (video is None):
         raise RequestError("give either --camera NUMBER or --video FILE")
@@ -120,8 +111,7 @@ def check_live_options(options: LiveOptions) -> None:
         require_video(video)
     if out is None:
         return
-    if out.is_dir():
-        raise RequestError(f"--out {out}: is a folder; name a file")
+    require_out_file(out)
     if out.suffix.lower() != ".mp4":
         raise RequestError(f"--out {out}: name an .mp4 file")
     if video is not None and out.exists() and out.samefile(video):
@@ -130,7 +120,7 @@ def check_live_options(options: LiveOptions) -> None:
 
 def load_forecaster(
     checkpoint: str, dataset: Path | None
-) -> tuple[str, LiveForecaster, SequenceSettings]:
+) -> tuple[str, LandmarkForecaster | NetworkForecaster, SequenceSettings]:
     """Name, forecasts and sequence settings of a network or a baseline.
 
     A baseline with parameters is fitted to every sequence of the dataset.
@@ -143,16 +133,13 @@ def load_forecaster(
         known = LandmarkSequences(np.zeros((1, 1, NUM_LANDMARKS, 2), np.float32), ("nobody",))
         if checkpoint not in UNFITTED:
             if dataset is None:
-                raise RequestError(
-                    f"--checkpoint {checkpoint}: has parameters; name a --dataset to fit it to"
-                )
+                missing = "has parameters; name a --dataset to fit it to"
+                raise RequestError(f"--checkpoint {checkpoint}: {missing}")
             with FaceDataset(dataset) as opened:
                 settings = opened.manifest.settings
                 every = opened.indices().tolist()
-                known = LandmarkSequences(
-                    np.stack([opened.landmarks(i)[..., :2] for i in every]),
-                    tuple(opened.entry(i).subject for i in every),
-                )
+                landmarks = np.stack([opened.landmarks(i)[..., :2] for i in every])
+                known = LandmarkSequences(landmarks, tuple(opened.entry(i).subject for i in every))
         predictor = BaselinePredictor(fit_forecaster(checkpoint, known))
         return checkpoint, LandmarkForecaster(predictor, HORIZON), settings
     folder = Path(checkpoint)

@@ -15,7 +15,7 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from face_prediction.dataset.build import find_videos, require_same_video, video_of
+from face_prediction.dataset.build import find_videos, source_video
 from face_prediction.dataset.histories import (
     crop_history,
     errors_across,
@@ -47,10 +47,6 @@ logger = logging.getLogger(__name__)
 
 HORIZON = 5
 """Frames ahead (paper, IV.A)."""
-CONTENT = (
-    "predicted_mouth[t, h - 1]: where the mouth was forecast, at frame t, to be at frame t + h; "
-    "parallel to the image, at the depth of frame t"
-)
 _SAME_PLACE = 1e-5  # m: two liftings of one track agree to this; a library holds float32
 
 
@@ -103,12 +99,8 @@ def run_predict(options: PredictOptions) -> int:
     with FaceDataset(options.dataset) as dataset:
         manifest = dataset.manifest
         fits = cross_fit(dataset, options.checkpoints, options.baseline)
-    lifted, withheld = lift_clips(
-        options.tracks,
-        options.attribution,
-        motion_settings,
-        None if given is None else set(given.run_clip.tolist()),
-    )
+    only = None if given is None else set(given.run_clip.tolist())
+    lifted, withheld = lift_clips(options.tracks, options.attribution, motion_settings, only)
     clips = [clip for clip in lifted if clip.motion.runs]
     folds = {clip.row.clip: fold_of(clip, manifest) for clip in clips}
     predictors = [fits.predictor_for(folds[clip.row.clip], clip.row.subject) for clip in clips]
@@ -120,21 +112,22 @@ def run_predict(options: PredictOptions) -> int:
     forecasts: list[NDArray[np.float64]] = []
     short: dict[str, int] = {}
     # the videos are checked before the first is forecast, which may take an hour
-    paths = [
-        find_video(clip, videos) if predictor.needs.frames else None
-        for clip, predictor in zip(clips, predictors, strict=True)
-    ]
+    paths: list[Path | None] = [None] * len(clips)
+    for i, (clip, predictor) in enumerate(zip(clips, predictors, strict=True)):
+        if predictor.needs.frames:
+            paths[i], _ = source_video(clip.path, load_track(clip.path), videos)
+    settings = manifest.settings
     for clip, predictor, video in zip(clips, predictors, paths, strict=True):
-        ahead, short[clip.row.clip] = forecast_clip(
-            clip, predictor, manifest.settings, video, options.progress
-        )
-        forecasts.append(ahead)
+        found = forecast_clip(clip, predictor, settings, video, options.progress)
+        forecasts.append(found[0])
+        short[clip.row.clip] = found[1]
     library = replace(library, predicted_mouth=np.concatenate(forecasts).astype(np.float32))
     errors = errors_by_clip(library)
     record = {
-        "what": CONTENT,
+        "what": "predicted_mouth[t, h - 1]: where the mouth was forecast, at frame t, to be at "
+        "frame t + h; parallel to the image, at the depth of frame t",
         "predictor": fits.name,
-        "history": manifest.settings.history,
+        "history": settings.history,
         "dataset_sha256": file_digest(options.dataset / MANIFEST_NAME),
         "checkpoint_sha256": {
             str(fold): file_digest(fitted.folder / "model.safetensors")
@@ -155,15 +148,12 @@ def run_predict(options: PredictOptions) -> int:
 def require_same_motion(
     given: RecordedMotion, clips: Sequence[LiftedClip], settings: MotionSettings
 ) -> None:
-    """Check that a library was made from these clips.
-
-    Raises:
-        RequestError: one of its clips is missing, or it was made from other tracks.
-    """
+    """Raise RequestError if a clip of a library is missing, or it was made from other tracks."""
     missing = sorted(set(given.run_clip.tolist()) - {clip.row.clip for clip in clips})
     if missing:
+        clip_names = ", ".join(missing)
         raise RequestError(
-            f"--library: no track with ship=yes of its clips {', '.join(missing)}; give them"
+            f"--library: no track with ship=yes of its clips {clip_names}; give them"
         )
     made = record_motion(clips, settings, 0)
     for key in ("run_clip", "run_subject", "run_length", "mouth"):
@@ -193,18 +183,6 @@ def fold_of(clip: LiftedClip, manifest: Manifest) -> int | None:
                 f"'{entry.subject}' in the dataset; use one name for one person"
             )
     return {entry.subject: entry.fold for entry in manifest.clips}.get(clip.row.subject)
-
-
-def find_video(clip: LiftedClip, videos: dict[str, list[Path]]) -> Path:
-    """The video of a clip.
-
-    Raises:
-        RequestError: it is in no folder, or is not the one that the track was made from.
-    """
-    track = load_track(clip.path)
-    video = video_of(clip.path, track, videos)
-    require_same_video(clip.path, track, video)
-    return video
 
 
 def forecast_clip(
@@ -271,19 +249,14 @@ def errors_by_clip(library: RecordedMotion) -> dict[str, dict[str, list[float]]]
         mouth = library.mouth[part].astype(np.float64)
         ahead = library.predicted_mouth[part].astype(np.float64)
         still = np.repeat(mouth[:, None], ahead.shape[1], axis=1)
-        pooled.setdefault(name, []).append(
-            (errors_across(ahead, mouth), errors_across(still, mouth))
-        )
+        pair = (errors_across(ahead, mouth), errors_across(still, mouth))
+        pooled.setdefault(name, []).append(pair)
     pooled["all"] = [pair for pairs in pooled.values() for pair in pairs]
     result: dict[str, dict[str, list[float]]] = {}
     for name, pairs in pooled.items():
-        ours, still = (
-            np.nanmean(np.concatenate(side), axis=0) for side in zip(*pairs, strict=True)
-        )
-        result[name] = {
-            "forecast": [round(1e3 * float(value), 4) for value in ours],
-            "persistence": [round(1e3 * float(value), 4) for value in still],
-        }
+        for side, errors in zip(("forecast", "persistence"), zip(*pairs, strict=True), strict=True):
+            means = np.nanmean(np.concatenate(errors), axis=0)
+            result.setdefault(name, {})[side] = [round(1e3 * float(value), 4) for value in means]
     return result
 
 

@@ -17,11 +17,10 @@ def run_train(options: FaceTrainOptions) -> int:
             installed.
     """
     try:
-        from face_prediction.training.setup import train_predictor  # not at the top: loads torch
+        from face_prediction.training.trainer import train_predictor  # not at the top: loads torch
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        raise RequestError(
-            "training needs PyTorch; pip install 'robo_manip_baselines[face-prediction]'"
-        ) from None
+        install = "pip install 'robo_manip_baselines[face-prediction]'"
+        raise RequestError(f"training needs PyTorch; {install}") from None
     return train_predictor(options)

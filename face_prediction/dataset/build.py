@@ -66,11 +66,12 @@ def find_videos(folders: Iterable[Path]) -> dict[str, list[Path]]:
     return found
 
 
-def video_of(path: Path, track: FaceTrack, videos: dict[str, list[Path]]) -> Path:
-    """The video that the track from ``path`` names as its source.
+def source_video(path: Path, track: FaceTrack, videos: dict[str, list[Path]]) -> tuple[Path, str]:
+    """The video that the track from ``path`` was made from, and its SHA-256.
 
     Raises:
-        RequestError: there is none of that name, or several.
+        RequestError: there is none of its name, or several, or it is another one; where the video
+            breaks off, the message says that.
     """
     name = str(track.source.get("name", ""))
     found = videos.get(name, [])
@@ -78,18 +79,10 @@ def video_of(path: Path, track: FaceTrack, videos: dict[str, list[Path]]) -> Pat
         raise RequestError(f"{path}: its video '{name}' is in no folder of --videos")
     if len(found) > 1:
         raise RequestError(f"{path}: {' and '.join(map(str, found))} are both named '{name}'")
-    return found[0]
-
-
-def require_same_video(path: Path, track: FaceTrack, video: Path) -> str:
-    """Check that the track from ``path`` was made from this very video, and return its SHA-256.
-
-    Raises:
-        RequestError: it was not; where the video breaks off, the message says that.
-    """
+    video = found[0]
     digest = file_digest(video)
     if track.source.get("sha256") == digest:
-        return digest
+        return video, digest
     with VideoReader(video) as reader:
         for _ in reader.frames():  # raises where the file breaks off, which explains the hash
             pass
@@ -107,12 +100,8 @@ def build_clip(
 ) -> bool:
     """Make the file of the clip with the track at ``path``, unless it is up to date.
 
-    Args:
-        path: of the track.
-        videos: the videos to choose from, see `find_videos`.
-        out: folder of the dataset.
-        settings: of the sequences.
-        bar: first words of a progress bar; None: no bar.
+    ``videos`` are as `find_videos` gives them, ``out`` is the folder of the dataset, and ``bar``
+    holds the first words of a progress bar (None: no bar).
 
     Returns:
         True: it was made; False: it was there, from the same sources, and is kept.
@@ -122,12 +111,12 @@ def build_clip(
             the clip's file is of another kind.
     """
     track = load_track(path)
-    video = video_of(path, track, videos)
+    video, video_sha256 = source_video(path, track, videos)
     record = {
         "clip": path.stem,
         "track_sha256": file_digest(path),
         "video": video.name,
-        "video_sha256": require_same_video(path, track, video),
+        "video_sha256": video_sha256,
         "settings": settings.to_json(),
     }
     target = out / CLIP_FOLDER / f"{path.stem}.h5"
@@ -169,38 +158,33 @@ def clip_entry(out: Path, row: Attribution, kind: str) -> ClipEntry:
 def track_frames(
     path: Path, track: FaceTrack, label: str | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Numbers and images (H, W, 3) of the decoded frames of a track's video.
+    """Numbers and images (H, W, 3) of the decoded frames of a track's video at ``path``.
 
-    Args:
-        path: the video.
-        track: of the same video.
-        label: of a progress bar; None: no bar.
+    ``label`` is that of a progress bar; None: no bar.
 
     Raises:
         RequestError: the video breaks off, or its frames are not those of the track.
     """
+
+    def wrong(problem: str) -> RequestError:
+        return RequestError(f"{path}: {problem}; extract the track again")
+
     times = track.source_timestamps
     count = 0
     with VideoReader(path) as video:
         for frame in with_bar(video.frames(), len(times), label):
             height, width = frame.image.shape[:2]
             if (width, height) != track.image_size:
-                raise RequestError(
-                    f"{path}: {width}x{height} pixels, its track says "
-                    f"{track.image_size[0]}x{track.image_size[1]}; extract the track again"
-                )
+                theirs = "x".join(map(str, track.image_size))
+                raise wrong(f"{width}x{height} pixels, its track says {theirs}")
             if count < len(times):
                 if abs(frame.time - times[count]) > SAME_CLOCK:
-                    raise RequestError(
-                        f"{path}: frame {count} is at {frame.time:.4f} s, its track says "
-                        f"{times[count]:.4f} s; extract the track again"
-                    )
+                    at = f"frame {count} is at {frame.time:.4f} s"
+                    raise wrong(f"{at}, its track says {times[count]:.4f} s")
                 yield count, frame.image
             count += 1
     if count != len(times):
-        raise RequestError(
-            f"{path}: {count} frames, its track says {len(times)}; extract the track again"
-        )
+        raise wrong(f"{count} frames, its track says {len(times)}")
 
 
 def cut_images(
@@ -238,35 +222,24 @@ def cut_images(
 
 def kind_table(clips: Sequence[ClipEntry], rows: Sequence[SequenceRow]) -> str:
     """Markdown: per kind of footage, counts and the medians of statistics."""
-
-    def cells(name: str, clips: Sequence[ClipEntry], rows: Sequence[SequenceRow]) -> list[object]:
-        medians = [
-            " ".join(
-                f"{factor * float(np.median([row.statistics[key] for row in rows])):.{digits}f}"
-                for key in keys
-            )
-            if rows
-            else "–"
-            for _, keys, factor, digits in _MEDIANS
-        ]
-        return [
-            name,
-            len({clip.subject for clip in clips if clip.sequences}),
-            sum(clip.sequences > 0 for clip in clips),
-            sum(clip.candidates == 0 for clip in clips),
-            sum(clip.sequences for clip in clips),
-            *(sum(clip.dropped.get(reason, 0) for clip in clips) for reason in REASONS),
-            *medians,
-        ]
-
     head = ["footage", "subjects", "clips", "too short", "sequences"]
     head += [name.replace("_", " ") for name in REASONS] + [heading for heading, *_ in _MEDIANS]
-    by_kind = [
-        cells(kind, part, [row for row in rows if row.kind == kind])
-        for kind in KINDS
-        if (part := [clip for clip in clips if clip.kind == kind])
-    ]
-    return "\n".join(markdown_table(head, [*by_kind, cells("all", clips, rows)]))
+    table: list[list[object]] = []
+    for kind in (*KINDS, "all"):
+        part = [clip for clip in clips if kind in ("all", clip.kind)]
+        found = [row.statistics for row in rows if kind in ("all", row.kind)]
+        if not part and kind != "all":
+            continue
+        people = len({clip.subject for clip in part if clip.sequences})
+        sums = [sum(clip.sequences > 0 for clip in part), sum(not c.candidates for c in part)]
+        sums.append(sum(clip.sequences for clip in part))
+        sums += [sum(clip.dropped.get(reason, 0) for clip in part) for reason in REASONS]
+        table.append([kind, people, *sums])
+        for _, keys, factor, digits in _MEDIANS:
+            columns = [[row[key] for row in found] for key in keys] if found else []
+            medians = [factor * float(np.median(column)) for column in columns]
+            table[-1].append(" ".join(f"{value:.{digits}f}" for value in medians) or "–")
+    return "\n".join(markdown_table(head, table))
 
 
 def fold_table(clips: Sequence[ClipEntry], folds: int) -> str:

@@ -51,12 +51,8 @@ def encode_image(image: np.ndarray, quality: int) -> np.ndarray:
     """JPEG bytes (N,) uint8 (4:2:0) of ``image`` (H, W, 3)."""
     import cv2  # only images need it
 
-    options = [
-        cv2.IMWRITE_JPEG_QUALITY,
-        quality,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
-    ]
+    sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling]
     is_done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
     if not is_done:
         raise ValueError(f"OpenCV did not encode an image of shape {image.shape}")
@@ -71,16 +67,11 @@ def decode_image(data: np.ndarray, reduce: int = 1) -> np.ndarray:
     """
     import cv2
 
-    flags = {
-        1: cv2.IMREAD_COLOR,
-        2: cv2.IMREAD_REDUCED_COLOR_2,
-        4: cv2.IMREAD_REDUCED_COLOR_4,
-        8: cv2.IMREAD_REDUCED_COLOR_8,
-    }
-    if reduce not in flags:
+    if reduce not in REDUCTIONS:
         raise ValueError(f"reduce {reduce}: one of {', '.join(map(str, REDUCTIONS))}")
+    flag = cv2.IMREAD_COLOR if reduce == 1 else getattr(cv2, f"IMREAD_REDUCED_COLOR_{reduce}")
     try:
-        image = cv2.imdecode(data, flags[reduce]) if data.size else None
+        image = cv2.imdecode(data, flag) if data.size else None
     except cv2.error as error:
         raise ValueError(f"no image: {str(error).strip()}") from error
     if image is None:
@@ -127,13 +118,7 @@ def write_clip(
 ) -> None:
     """Write the file of one clip, whole or not at all. The same content gives the same bytes.
 
-    Args:
-        path: the file; replaced if it is there.
-        frames: of the whole clip.
-        sequences: starts, crops and counts.
-        images: of the sequences.
-        statistics: the columns of `STATISTICS`, each (N,).
-        record: sources and settings of the file; see `build.clip_record`.
+    ``statistics`` are the columns of `STATISTICS`, each (N,), ``record`` sources and settings.
     """
     with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
         file.attrs["schema"] = SCHEMA
@@ -190,10 +175,8 @@ def open_clip(path: Path) -> h5py.File:
         except READ_ERRORS as error:
             raise RequestError(f"{path}: {damage(error)}") from None
         if schema != SCHEMA or version != VERSION:
-            raise RequestError(
-                f"{path}: schema '{schema}' version {version}, expected '{SCHEMA}' {VERSION}; "
-                "make the dataset again"
-            )
+            expected = f"expected '{SCHEMA}' {VERSION}; make the dataset again"
+            raise RequestError(f"{path}: schema '{schema}' version {version}, {expected}")
         stack.pop_all()
         return file
 

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from face_prediction.dataset.build import track_frames
 from face_prediction.dataset.clip_file import decode_image, encode_image, reduction
 from face_prediction.dataset.sequences import SequenceSettings
-from face_prediction.forecast import mouth_centre
+from face_prediction.forecast.interface import Array, mouth_centre
 from face_prediction.motion.motion import Quality
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.geometry import Crop, crop_around, image_points, image_rays
-from face_prediction.tracking.tracks import FaceTrack
+from face_prediction.tracking.tracks import FaceTrack, Size
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Origin:
 
 def find_origins(
     frames: Sequence[int],
-    landmarks: NDArray[np.floating],
-    image_size: tuple[int, int],
+    landmarks: Array,
+    image_size: Size,
     quality: Quality,
     length: int,
     margin: float,
@@ -58,14 +58,8 @@ def find_origins(
 
     A history does not reach back across a lost face, a spike or a jump of the detector; where
     that leaves less, the face is taken to have been at rest before.
-
-    Args:
-        frames: of the clip, each in a stretch without any of those.
-        landmarks: (T of the clip, L, 2 or 3) normalised image coordinates.
-        image_size: (width, height) in pixels.
-        quality: of the clip's frames.
-        length: frames of a history.
-        margin: of the crop, see `crop_around`.
+    ``frames`` are each in a stretch without any of those; ``landmarks`` (T of the clip, L, 2 or 3)
+    are normalised image coordinates, and ``margin`` is that of `crop_around`.
     """
     begins = np.zeros(len(landmarks), dtype=np.int64)
     for start, stop in quality.segments():
@@ -78,15 +72,13 @@ def find_origins(
     return origins
 
 
-def crop_history(
-    origin: Origin, landmarks: NDArray[np.floating], image_size: tuple[int, int]
-) -> NDArray[np.float32]:
+def crop_history(origin: Origin, landmarks: Array, image_size: Size) -> NDArray[np.float32]:
     """The landmarks (T, L, 2) of a history in its crop."""
     points = origin.crop.normalise(landmarks[origin.history], image_size)
     return points[..., :2].astype(np.float32)
 
 
-def dataset_picture(
+def dataset_image(
     image: NDArray[np.uint8], crop: Crop, settings: SequenceSettings, size: int
 ) -> NDArray[np.uint8]:
     """The image (S, S, 3) of side ``size`` that a dataset holds of ``image`` under ``crop``.
@@ -106,18 +98,13 @@ def history_images(
     track: FaceTrack,
     source_frame: NDArray[np.integer],
     origins: Sequence[Origin],
-    needs: PictureNeeds,
+    needs: ImageNeeds,
     settings: SequenceSettings,
 ) -> Iterator[NDArray[np.uint8]]:
     """The images (P, S, S, 3) of each of ``origins``, whose frames must increase.
 
-    Args:
-        path: the video.
-        track: of the same video.
-        source_frame: (T of the clip,) the decoded frame nearest to each frame.
-        origins: frames that are forecast from.
-        needs: how many images, and of what size.
-        settings: of the dataset.
+    They are cut out of the video at ``path``, that of ``track``; ``source_frame`` (T of the clip,)
+    is the decoded frame nearest to each frame.
 
     Raises:
         RequestError: the video breaks off, or is not the one of the track; or a dataset with these
@@ -136,7 +123,7 @@ def history_images(
             wanted, crop = waiting.pop(), crops.pop()
             for n in wanted:
                 if (n, crop) not in cut:
-                    cut[n, crop] = dataset_picture(decoded[n], crop, settings, needs.size)
+                    cut[n, crop] = dataset_image(decoded[n], crop, settings, needs.size)
             yield np.stack([cut[n, crop] for n in wanted])
             if not waiting:
                 return
@@ -146,19 +133,11 @@ def history_images(
             cut = {(n, c): kept for (n, c), kept in cut.items() if n >= first and c == crop}
 
 
-def mouth_ahead(
-    mouth: NDArray[np.floating],
-    now: NDArray[np.floating],
-    ahead: NDArray[np.floating],
-    image_size: tuple[int, int],
-) -> NDArray[np.float64]:
+def mouth_ahead(mouth: Array, now: Array, ahead: Array, image_size: Size) -> NDArray[np.float64]:
     """Mouth positions (N, H, 3) in metres from forecasts of the mouth centre in the image.
 
-    Args:
-        mouth: (N, 3) m, present position; camera frame.
-        now: (N, 2) present centre, normalised image coordinates.
-        ahead: (N, H, 2) forecast centre.
-        image_size: (width, height) in pixels.
+    ``mouth`` (N, 3) m is the present position in the camera frame; ``now`` (N, 2) is the present
+    centre and ``ahead`` (N, H, 2) the forecast ones, in normalised image coordinates.
     """
     moved = image_rays(ahead, image_size) - image_rays(now, image_size)[:, None]
     here = np.asarray(mouth, dtype=np.float64)[:, None]
@@ -166,39 +145,24 @@ def mouth_ahead(
 
 
 def forecast_metres(
-    origins: Sequence[Origin],
-    forecasts: NDArray[np.floating],
-    landmarks: NDArray[np.floating],
-    mouth: NDArray[np.floating],
-    image_size: tuple[int, int],
+    origins: Sequence[Origin], forecasts: Array, landmarks: Array, mouth: Array, image_size: Size
 ) -> NDArray[np.float64]:
-    """Mouth positions (N, H, 3) in metres of forecasts (N, H, L, 2) in crops.
+    """Mouth positions (N, H, 3) in metres of forecasts (N, H, L, 2) in the crops of N origins.
 
-    Args:
-        origins: N of them.
-        forecasts: one for each.
-        landmarks: (T of the clip, L, 2 or 3) normalised image coordinates.
-        mouth: (T of the clip, 3) m.
-        image_size: (width, height) in pixels.
+    Of the whole clip: ``landmarks`` (T, L, 2 or 3), normalised image coordinates, and ``mouth``
+    (T, 3) m.
     """
     frames = [origin.frame for origin in origins]
-    ahead = [
-        image_points(origin.crop, centre, image_size)
-        for origin, centre in zip(origins, mouth_centre(forecasts), strict=True)
-    ]
+    pairs = zip(origins, mouth_centre(forecasts), strict=True)
+    ahead = [image_points(origin.crop, centre, image_size) for origin, centre in pairs]
     return mouth_ahead(mouth[frames], mouth_centre(landmarks[frames]), np.stack(ahead), image_size)
 
 
-def errors_across(
-    predicted: NDArray[np.floating], mouth: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def errors_across(predicted: Array, mouth: Array) -> NDArray[np.float64]:
     """Errors (N, H) in metres across the view of a run's forecasts.
 
-    NaN where the run has ended by then.
-
-    Args:
-        predicted: (N, H, 3) m of the successive frames of one run.
-        mouth: (N, 3) m.
+    ``predicted`` (N, H, 3) m and ``mouth`` (N, 3) m are of the successive frames of one run; NaN
+    where it has ended by then.
     """
     count, horizon = predicted.shape[:2]
     errors = np.full((count, horizon), np.nan)

@@ -8,7 +8,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -79,18 +78,6 @@ class Manifest:
     seed: int
     clips: tuple[ClipEntry, ...]
 
-    def to_json(self) -> dict[str, Any]:
-        """What `read_manifest` takes."""
-        return {
-            "schema": SCHEMA,
-            "version": VERSION,
-            "settings": self.settings.to_json(),
-            "folds": self.folds,
-            "seed": self.seed,
-            "subjects": {c.subject: c.fold for c in self.clips if c.fold is not None},
-            "clips": [asdict(clip) for clip in self.clips],
-        }
-
 
 def assign_folds(clips: Iterable[ClipEntry], folds: int, seed: int) -> dict[str, int]:
     """A fold for every subject, so that folds hold about as much of each kind, and in all.
@@ -111,9 +98,8 @@ def assign_folds(clips: Iterable[ClipEntry], folds: int, seed: int) -> dict[str,
     total = sum(of_kind.values())
     people = [name for name in sorted(by_subject) if sum(by_subject[name].values()) > 0]
     if len(people) < folds:
-        raise RequestError(
-            f"--folds {folds}: only {len(people)} subjects have sequences; give at most that many"
-        )
+        limit = f"only {len(people)} subjects have sequences; give at most that many"
+        raise RequestError(f"--folds {folds}: {limit}")
     rng = np.random.default_rng([seed, *b"folds"])
     shuffled = [people[i] for i in rng.permutation(len(people))]
     shuffled.sort(key=lambda name: -sum(by_subject[name].values()))
@@ -134,11 +120,7 @@ def assign_folds(clips: Iterable[ClipEntry], folds: int, seed: int) -> dict[str,
 
 
 def require_fold_options(folds: int, seed: int) -> None:
-    """Check both numbers before any work is done.
-
-    Raises:
-        RequestError: one is out of its range.
-    """
+    """Raise RequestError if a number is out of its range, before any work is done."""
     if folds < 1:
         raise RequestError(f"--folds {folds}: 1 or more")
     if seed < 0:
@@ -172,7 +154,16 @@ def fold_split(folds: int, test: int) -> FoldSplit:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write ``dataset.json``, whole or not at all."""
-    text = json.dumps(manifest.to_json(), indent=1, ensure_ascii=False)
+    content = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "settings": manifest.settings.to_json(),
+        "folds": manifest.folds,
+        "seed": manifest.seed,
+        "subjects": {c.subject: c.fold for c in manifest.clips if c.fold is not None},
+        "clips": [asdict(clip) for clip in manifest.clips],
+    }
+    text = json.dumps(content, indent=1, ensure_ascii=False)
     write_text(folder / MANIFEST_NAME, text + "\n")
 
 
@@ -185,33 +176,29 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / MANIFEST_NAME
     if not path.is_file():
-        raise RequestError(
-            f"{folder}: no dataset ({MANIFEST_NAME} is not there); make one with build-dataset"
-        )
+        missing = f"no dataset ({MANIFEST_NAME} is not there)"
+        raise RequestError(f"{folder}: {missing}; make one with build-dataset")
+    again = "make the dataset again"
     try:
         data = read_json(path)
     except RequestError as error:
-        raise RequestError(f"{error}; make the dataset again") from None
-    schema, version = data.get("schema"), data.get("version")
-    if (schema, version) != (SCHEMA, VERSION):
-        raise RequestError(
-            f"{path}: schema '{schema}' version {version}, expected '{SCHEMA}' {VERSION}; "
-            "make the dataset again"
-        )
+        raise RequestError(f"{error}; {again}") from None
+    if (found := (data.get("schema"), data.get("version"))) != (SCHEMA, VERSION):
+        kind = f"schema '{found[0]}' version {found[1]}"
+        raise RequestError(f"{path}: {kind}, expected '{SCHEMA}' {VERSION}; {again}")
     try:
         clips = tuple(ClipEntry(**row) for row in data["clips"])
         settings = SequenceSettings.from_json(data["settings"])
         manifest = Manifest(settings, int(data["folds"]), int(data["seed"]), clips)
     except (KeyError, TypeError, ValueError) as error:
-        raise RequestError(f"{path}: not as expected ({error}); make the dataset again") from None
+        raise RequestError(f"{path}: not as expected ({error}); {again}") from None
     fold_of: dict[str, int | None] = {}
     for clip in manifest.clips:
         if Path(clip.clip).name != clip.clip:
             raise RequestError(f"{path}: '{clip.clip}' is no name of a clip")
         if clip.sequences and clip.fold not in range(manifest.folds):
-            raise RequestError(
-                f"{path}: clip '{clip.clip}' is in fold {clip.fold}, there are {manifest.folds}"
-            )
+            wrong = f"is in fold {clip.fold}, there are {manifest.folds}"
+            raise RequestError(f"{path}: clip '{clip.clip}' {wrong}")
         if fold_of.setdefault(clip.subject, clip.fold) != clip.fold:
             raise RequestError(f"{path}: subject '{clip.subject}' is in two folds")
     if len({clip.clip for clip in manifest.clips}) < len(manifest.clips):

@@ -44,7 +44,7 @@ class FaceSequence:
     """One sequence, as a camera that stands still around the face records it.
 
     Attributes:
-        pictures: (F, S, S, 3) uint8 RGB.
+        images: (F, S, S, 3) uint8 RGB.
         landmarks: (F, 468, 3) float32: u right and v down, 0...1 across the image, and MediaPipe's
             relative depth in the same unit.
         timestamps: (F,) float64 s on the video's clock.
@@ -53,7 +53,7 @@ class FaceSequence:
         mouth: (F, 3) float64 m, mouth centre in the camera frame.
     """
 
-    pictures: np.ndarray
+    images: np.ndarray
     landmarks: np.ndarray
     timestamps: np.ndarray
     interpolated: np.ndarray
@@ -126,7 +126,7 @@ class FaceDataset:
         reader, number = self._reader(index)
         return reader.landmarks(number)
 
-    def pictures(self, index: int, frames: slice | None = None, reduce: int = 1) -> np.ndarray:
+    def images(self, index: int, frames: slice | None = None, reduce: int = 1) -> np.ndarray:
         """Images (F, S / reduce, S / reduce, 3) uint8 RGB; only those of ``frames`` are decoded.
 
         Raises:
@@ -134,14 +134,14 @@ class FaceDataset:
             ValueError: ``reduce`` is not 1, 2, 4 or 8.
         """
         reader, number = self._reader(index)
-        return reader.pictures(number, frames or slice(None), reduce)
+        return reader.images(number, frames or slice(None), reduce)
 
     def read(self, index: int, reduce: int = 1) -> FaceSequence:
-        """One whole sequence. Raises as `pictures` does."""
+        """One whole sequence. Raises as `images` does."""
         reader, number = self._reader(index)
         rows = reader.rows(number)
         return FaceSequence(
-            pictures=reader.pictures(number, slice(None), reduce),
+            images=reader.images(number, slice(None), reduce),
             landmarks=reader.landmarks(number),
             timestamps=reader.array("frames/timestamps", rows),
             interpolated=reader.array("frames/interpolated", rows),
@@ -219,10 +219,8 @@ class _ClipReader:
             if len(self.start) != clip.sequences or self._index.shape != shape:
                 wrong.append("sequences")
             if wrong:
-                raise RequestError(
-                    f"{path}: its {', '.join(wrong)} are not those of the dataset; "
-                    "make the dataset again"
-                )
+                problem = f"its {', '.join(wrong)} are not those of the dataset"
+                raise RequestError(f"{path}: {problem}; make the dataset again")
         except RequestError:
             self.file.close()
             raise
@@ -242,7 +240,7 @@ class _ClipReader:
         points = self.array("frames/landmarks", self.rows(number))
         return crop.normalise(points, self._image_size).astype(np.float32)
 
-    def pictures(self, number: int, frames: slice, reduce: int) -> np.ndarray:
+    def images(self, number: int, frames: slice, reduce: int) -> np.ndarray:
         if reduce not in REDUCTIONS:
             raise ValueError(f"reduce {reduce}: one of {', '.join(map(str, REDUCTIONS))}")
         index = self._index[number][frames]

@@ -18,7 +18,7 @@ from face_prediction.motion.library import Attribution
 from face_prediction.motion.motion import Quality, QualityLimits, assess
 from face_prediction.tracking.extract import SAME_TIME, Samples, resample
 from face_prediction.tracking.geometry import LIPS, Crop, crop_around, lift_landmarks
-from face_prediction.tracking.tracks import FaceTrack
+from face_prediction.tracking.tracks import FaceTrack, Size
 from robo_manip_baselines.runs.errors import RequestError
 
 CropFrom = Literal["history", "sequence"]
@@ -115,10 +115,10 @@ def kind_of(row: Attribution) -> str:
     Raises:
         RequestError: ``kind`` is none of `KINDS`.
     """
-    if row.kind:
-        if row.kind not in KINDS:
-            raise RequestError(f"kind '{row.kind}' of clip '{row.clip}'; one of {', '.join(KINDS)}")
+    if row.kind in KINDS:
         return row.kind
+    if row.kind:
+        raise RequestError(f"kind '{row.kind}' of clip '{row.clip}'; one of {', '.join(KINDS)}")
     if row.clip.lower().startswith("grid"):
         return "grid"
     words = "|".join(HEAD_MOTION_WORDS)
@@ -152,7 +152,7 @@ class ClipFrames:
     jaw: np.ndarray
     source_frame: np.ndarray
     image_lag: np.ndarray
-    image_size: tuple[int, int]
+    image_size: Size
     quality: Quality
 
     def __len__(self) -> int:
@@ -235,10 +235,8 @@ def find_sequences(frames: ClipFrames, settings: SequenceSettings) -> Sequences:
         else:
             kept.append(start)
     seen = settings.history if settings.crop_from == "history" else length
-    crops = tuple(
-        crop_around(frames.landmarks[s : s + seen], frames.image_size, settings.margin)
-        for s in kept
-    )
+    faces = [frames.landmarks[start : start + seen] for start in kept]
+    crops = tuple(crop_around(part, frames.image_size, settings.margin) for part in faces)
     return Sequences(np.array(kept, dtype=np.int64), crops, len(starts), dropped)
 
 

@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,7 @@ EQUATIONS = (
 )
 """Equations 6 and 7 of the paper, as `Camera.metres` computes them and as every file holds them."""
 QUANTILE_LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
-MAX_LAG = 10
-"""Strides that the autocorrelation is measured over, where a clip is long enough."""
+MAX_LAG = 10  # strides that the autocorrelation is measured over, where a clip is long enough
 _DECIMALS = 6  # of residuals in a run: a millionth of a crop, finer than any detector
 _TOLERANCE = 1e-6  # relative agreement asked of numbers that follow from others in the file
 
@@ -43,8 +43,7 @@ class Camera:
     ``crop_width`` and ``crop_height`` say how large the crop is in that camera's image.
 
     Attributes:
-        fov_x_deg: degrees across: the webcam of section IV.C.
-        fov_y_deg: degrees up.
+        fov_x_deg: degrees across, and ``fov_y_deg`` up: the webcam of section IV.C.
         depth_m: metres from the camera to the mouth (section IV.C).
         crop_width: the crop's side as a share of the image's width; 1: the crop is the image.
         crop_height: the same of the height.
@@ -92,8 +91,7 @@ class HorizonErrors:
 
     Attributes:
         frames: ahead, 1 is the next.
-        forecasts: number of them.
-        missing: forecasts there should have been.
+        forecasts: number of them, beside the ``missing``.
         mean_abs: mean of the absolute errors.
         var_abs: variance of the absolute errors.
         bias: mean of the signed errors.
@@ -129,8 +127,7 @@ class PredictorErrorStats:
         footage: kind of footage.
         fps: frames a second of the forecasts.
         stride_frames: frames between one forecast of a clip and the next.
-        sequences: number of them.
-        subjects: number of people.
+        sequences: number of them, of so many ``subjects``.
         data_sha256: of the truth and the forecasts.
         camera: for which errors are converted to metres.
         equations: of that conversion.
@@ -258,8 +255,7 @@ class MouthResiduals:
 
     Attributes:
         values: (N, H, 2) in crops; NaN where there is no forecast.
-        clips: N names of the clips that sequences come from.
-        subjects: N names of people.
+        clips: N names of the clips that sequences come from; ``subjects``: of their people.
         starts: N frame numbers in their clips; sequences of a clip whose starts are
             ``stride_frames`` apart are neighbours, of which the autocorrelation speaks.
         stride_frames: frames between neighbours.
@@ -285,7 +281,7 @@ def measure_error_stats(
     keep_runs: bool = True,
     max_run_frames: int | None = None,
 ) -> PredictorErrorStats:
-    """Statistics of mouth residuals.
+    """Statistics of mouth residuals; see `PredictorErrorStats`.
 
     Args:
         residuals: measured errors.
@@ -293,8 +289,8 @@ def measure_error_stats(
         fps: rate of the forecasts.
         camera: for which errors are converted to metres.
         keep_runs: hold the residuals themselves, to be resampled.
-        max_run_frames: forecasts of each clip that are held at most, its longest runs first;
-            None: all.
+        max_run_frames: forecasts of each clip that are held at most, its longest runs first: enough
+            to draw from; None: all.
 
     Raises:
         RequestError: lengths differ, or a horizon or the whole has no forecast.
@@ -311,31 +307,20 @@ def measure_error_stats(
         raise RequestError(f"{residuals.predictor}: no sequence has a forecast for every horizon")
     errors = mouth_errors(values)
     horizons: list[HorizonErrors] = []
-    for h in range(values.shape[1]):
+    for h, mean in enumerate(errors.mean):
         there = values[known[:, h], h]
-        horizons.append(
-            HorizonErrors(
-                frames=h + 1,
-                forecasts=int(errors.forecasts[h]),
-                missing=int(errors.missing[h]),
-                mean_abs=_as_tuples(errors.mean[h]),
-                var_abs=_as_tuples(errors.variance[h]),
-                bias=_as_tuples(there.mean(axis=0)),
-                quantiles=_as_tuples(np.quantile(there, QUANTILE_LEVELS, axis=0).T),
-                mean_abs_m=_as_tuples(camera.metres(errors.mean[h])),
-            )
-        )
+        quantiles = np.quantile(there, QUANTILE_LEVELS, axis=0).T
+        parts = (mean, errors.variance[h], there.mean(axis=0), quantiles, camera.metres(mean))
+        counts = int(errors.forecasts[h]), int(errors.missing[h])
+        horizons.append(HorizonErrors(h + 1, *counts, *map(_as_tuples, parts)))
     runs = neighbours(clips, residuals.starts, residuals.stride_frames)
     flat = values[complete].reshape(complete.sum(), -1)
     apart = flat - flat.mean(axis=0)
     covariance = apart.T @ apart / len(flat)
-    kept = [
-        ResidualRun(
-            clips[part[0]], subjects[part[0]], _as_tuples(np.round(values[part], _DECIMALS))
-        )
-        for run in runs
-        for part in _whole_parts(run, complete)
-    ]
+    kept: list[ResidualRun] = []
+    for part in (part for run in runs for part in _whole_parts(run, complete)):
+        held = _as_tuples(np.round(values[part], _DECIMALS))
+        kept.append(ResidualRun(clips[part[0]], subjects[part[0]], held))
     return PredictorErrorStats(
         predictor=residuals.predictor,
         footage=footage,
@@ -359,14 +344,13 @@ def neighbours(clips: Sequence[str], starts: Sequence[int], stride: int) -> list
 
     Every sequence is in one run; a run may have one.
     """
-    runs: list[list[int]] = []
-    for i in sorted(range(len(clips)), key=lambda i: (clips[i], starts[i])):
-        last = runs[-1][-1] if runs else None
-        if last is not None and (clips[last], starts[last] + stride) == (clips[i], starts[i]):
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    return [np.array(run) for run in runs]
+    order = sorted(range(len(clips)), key=lambda i: (clips[i], starts[i]))
+    cuts = [
+        place
+        for place, (a, b) in enumerate(pairwise(order), start=1)
+        if (clips[a], starts[a] + stride) != (clips[b], starts[b])
+    ]
+    return np.split(np.array(order), cuts)
 
 
 def autocorrelation(residuals: Floats, runs: Sequence[NDArray[np.intp]], max_lag: int) -> Floats:
@@ -392,8 +376,7 @@ def data_hash(*arrays: NDArray[np.generic]) -> str:
     """SHA-256 of shapes and values, the same on every machine."""
     digest = hashlib.sha256()
     for array in arrays:
-        plain = np.ascontiguousarray(array)
-        little = plain.astype(plain.dtype.newbyteorder("<"), copy=False)
+        little = array.astype(array.dtype.newbyteorder("<"), copy=False)
         digest.update(f"{little.dtype.str} {little.shape}\n".encode())
         digest.update(little.tobytes())
     return digest.hexdigest()
@@ -406,7 +389,6 @@ def _whole_parts(run: NDArray[np.intp], complete: NDArray[np.bool_]) -> list[lis
 
 
 def _shortened(runs: Sequence[ResidualRun], frames: int | None) -> tuple[ResidualRun, ...]:
-    """At most so many forecasts of each clip, its longest runs first: enough to draw from."""
     if frames is None:
         return tuple(runs)
     left = dict.fromkeys((run.clip for run in runs), frames)
@@ -426,9 +408,8 @@ def _finite(values: Any, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
     except ValueError:
         raise RequestError(f"'{key}' has rows of different lengths") from None
     wanted = ", ".join("n" if length is None else str(length) for length in shape)
-    fits = array.ndim == len(shape) and all(
-        length in (None, found) for length, found in zip(shape, array.shape, strict=True)
-    )
+    sizes = zip(shape, array.shape, strict=False)
+    fits = array.ndim == len(shape) and all(length in (None, found) for length, found in sizes)
     if not (fits and np.all(np.isfinite(array))):
         raise RequestError(f"'{key}' must be finite, of shape ({wanted})")
     return array

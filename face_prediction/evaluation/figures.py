@@ -6,18 +6,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
-from face_prediction.evaluation.errors import LEVELS
-from face_prediction.evaluation.scoring import EvaluationScores
+from face_prediction.dataset.image_batches import SequenceBatch
+from face_prediction.evaluation.scoring import LEVELS, EvaluationScores
 from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
-from face_prediction.evaluation.statistics import KindSummary, RowSummary
+from face_prediction.evaluation.statistics import KindSummary
 from face_prediction.prediction.errors import mouth_distances
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.geometry import LIPS
@@ -27,10 +26,8 @@ from robo_manip_baselines.runs.files import atomic_file
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of networks, which colour-blind readers can tell apart (Okabe and Ito)."""
 GREY = "#888888"
-MARKS = ("o", "s", "^", "D", "v", "x", "+", "*")
-"""Marks that tell the baselines apart, which are grey."""
-MOUTH_COLOUR, OTHER_COLOUR = "#00E000", "white"
-"""Colours of the mouth's landmarks, and of the others (paper, section IV.B)."""
+MARKS = ("o", "s", "^", "D", "v", "x", "+", "*")  # tell the baselines apart, which are grey
+MOUTH_COLOUR, OTHER_COLOUR = "#00E000", "white"  # of landmarks (paper, section IV.B)
 _LIVELIER_THAN = 0.9  # share of a kind that moves less than the sequence in the figures
 _PANEL = (4.2, 3.6)  # inches
 # inches from one image to the next, and to the left, above and on the other sides of all
@@ -66,26 +63,21 @@ def write_figures(
         RequestError: matplotlib is not installed, or the folder cannot be written to.
     """
     draw_errors(folder / "errors.png", summaries)
-    with_intervals = [s for s in summaries if any(row.has_intervals for row in s.rows)]
-    if with_intervals:
+    if with_intervals := [s for s in summaries if any(row.has_intervals for row in s.rows)]:
         draw_calibration(folder / "calibration.png", with_intervals)
     for summary in summaries:
         place = _lively_sequence(scores, summary.kind)
         index, row = int(setup.selection.indices[place]), setup.selection.rows[place]
         for predictor in setup.predictors:
-            size = predictor.image_size
-            if not size:
+            if not (size := predictor.image_size):
                 continue
-            batch = SequenceBatch(setup.dataset, [index], ImagePlan.of(predictor.needs, [size]))
-            forecast = predictor.forecast([row], batch)
+            batch = SequenceBatch(setup.dataset, [index], predictor.needs, [size])
+            truth = Forecast(batch.future, batch.future_images(size))
             name = re.sub(r"\W+", "_", predictor.name).strip("_")
-            draw_forecast(
-                folder / f"forecast_{summary.kind}_{name}.png",
-                f"{predictor.name}, {summary.kind}: clip {row.clip}",
-                setup.dataset.manifest.settings.history + 1,
-                truth=Forecast(batch.future, batch.future_images(size)),
-                forecast=forecast,
-            )
+            path = folder / f"forecast_{summary.kind}_{name}.png"
+            title = f"{predictor.name}, {summary.kind}: clip {row.clip}"
+            first = setup.dataset.manifest.settings.history + 1
+            draw_forecast(path, title, first, truth, predictor.forecast([row], batch))
 
 
 def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
@@ -94,14 +86,7 @@ def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
     Bands are 95 % intervals, of the networks and the best baseline.
     """
     ahead = np.arange(1, summaries[0].horizon + 1)
-    figure, panels = _draw_curves(
-        summaries,
-        "distance",
-        ahead,
-        legend_room=1.0,
-        has_curve=lambda row: True,
-        has_band=lambda row, best: row.role == "network" or row.name == best,
-    )
+    figure, panels = _draw_curves(summaries, "distance", ahead)
     for axes in panels:
         axes.set_xticks(ahead)
         axes.set_ylim(bottom=0)
@@ -112,21 +97,11 @@ def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
 
 def draw_calibration(path: Path, summaries: Sequence[KindSummary]) -> None:
     """Nominal against observed coverage of all forecast frames, a panel for each kind."""
-    figure, panels = _draw_curves(
-        summaries,
-        "pooled_coverage",
-        100 * np.array(LEVELS),
-        legend_room=1.1,
-        has_curve=lambda row: row.has_intervals,
-        has_band=lambda row, best: True,
-        factor=100.0,
-    )
+    percent = 100 * np.array(LEVELS)
+    figure, panels = _draw_curves(summaries, "pooled_coverage", percent, is_coverage=True)
     for axes in panels:
         axes.plot([0, 100], [0, 100], color="black", lw=0.8)
-        axes.set_xlim(0, 100)
-        axes.set_ylim(0, 100)
-        axes.set_box_aspect(1)
-        axes.set_xlabel("nominal coverage, %")
+        axes.set(xlim=(0, 100), ylim=(0, 100), box_aspect=1, xlabel="nominal coverage, %")
     panels[0].set_ylabel("observed coverage, %")
     _save_png(figure, path)
 
@@ -136,12 +111,7 @@ def draw_forecast(
 ) -> None:
     """A column for each frame; truth, truth with landmarks, forecast, forecast with landmarks.
 
-    Args:
-        path: file to write.
-        title: above all.
-        first_frame: number of the first forecast frame.
-        truth: of one sequence, images included.
-        forecast: of the same.
+    Both have one sequence with images; ``first_frame`` is the number of the first forecast frame.
     """
     count = truth.landmarks.shape[1]
     # squares of known size: a layout that looks for the best takes seconds for twenty of them
@@ -149,26 +119,19 @@ def draw_forecast(
     figure = new_matplotlib_figure(width, height, layout=None)
     figure.suptitle(title, y=1 - 0.1 / height, va="top")
     grid = figure.subplots(4, count, squeeze=False)
-    figure.subplots_adjust(
-        left=_LEFT / width,
-        bottom=_EDGE / height,
-        right=1 - _EDGE / width,
-        top=1 - _TOP / height,
-        wspace=_GAP,
-        hspace=_GAP,
-    )
+    # left, bottom, right, top
+    edges = (_LEFT / width, _EDGE / height, 1 - _EDGE / width, 1 - _TOP / height)
+    figure.subplots_adjust(*edges, wspace=_GAP, hspace=_GAP)
     for number, line in enumerate(grid):
         label, item = ("truth", truth) if number < 2 else ("forecast", forecast)
         has_landmarks = number % 2 == 1
-        assert item.pictures is not None
+        assert item.images is not None
         for column, axes in enumerate(line):
-            axes.imshow(item.pictures[0, column], extent=(0, 1, 1, 0), interpolation="nearest")
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.imshow(item.images[0, column], extent=(0, 1, 1, 0), interpolation="nearest")
+            axes.set(xticks=[], yticks=[])
             if has_landmarks:
                 _draw_landmarks(axes, item.landmarks[0, column])
-            axes.set_xlim(0, 1)
-            axes.set_ylim(1, 0)
+            axes.set(xlim=(0, 1), ylim=(1, 0))
         line[0].set_ylabel(f"{label}, landmarks" if has_landmarks else label)
     for frame, axes in enumerate(grid[0], start=first_frame):
         axes.set_title(f"frame {frame}")
@@ -180,15 +143,14 @@ def _draw_curves(
     key: str,
     x: NDArray[np.number],
     *,
-    legend_room: float,
-    has_curve: Callable[[RowSummary], bool],
-    has_band: Callable[[RowSummary, str], bool],
-    factor: float = 1.0,
+    is_coverage: bool = False,
 ) -> tuple[Any, Sequence[Any]]:
     """A figure with a panel for each kind: curves of the numbers ``key``, with their intervals.
 
-    Networks are in colour, baselines grey, the best of them black.
+    Networks are in colour, baselines grey, the best of them black. Coverage is in percent, of rows
+    with intervals only, and all of these have bands.
     """
+    legend_room, factor = (1.1, 100.0) if is_coverage else (1.0, 1.0)
     figure = new_matplotlib_figure(_PANEL[0] * len(summaries), _PANEL[1] + legend_room)
     panels = figure.subplots(1, len(summaries), squeeze=False)[0]
     handles: dict[str, Any] = {}
@@ -209,12 +171,12 @@ def _draw_curves(
                 mark = MARKS[others % len(MARKS)]
                 style = {"color": colour, "lw": 1.2, "ls": "--", "marker": mark, "ms": 5}
                 others += 1
-            if not has_curve(row):
+            if is_coverage and not row.has_intervals:
                 continue
             value, low, high = (factor * v[i] for v in (number.value, number.low, number.high))
             (line,) = axes.plot(x, value, **style)
             handles.setdefault(row.name, line)
-            if has_band(row, summary.best_baseline):
+            if is_coverage or row.role == "network" or row.name == summary.best_baseline:
                 axes.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
     columns = min(4, 2 * len(summaries))  # more would be wider than one panel
     place = {"loc": "outside lower center", "ncols": columns, "fontsize": "small"}
@@ -224,8 +186,8 @@ def _draw_curves(
 
 def _draw_landmarks(axes: Any, landmarks: NDArray[np.floating]) -> None:
     if not np.isfinite(landmarks).all():
-        axes.text(0.5, 0.5, "no face found", ha="center", va="center", color="white",
-                  bbox={"facecolor": "black", "alpha": 0.6})  # fmt: skip
+        box = {"facecolor": "black", "alpha": 0.6}
+        axes.text(0.5, 0.5, "no face found", ha="center", va="center", color="white", bbox=box)
         return
     is_mouth = np.zeros(len(landmarks), dtype=bool)
     is_mouth[list(LIPS)] = True

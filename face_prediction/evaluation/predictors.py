@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,8 @@ from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.dataset.manifest import MANIFEST_NAME, SequenceRow
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.forecast import FORECASTERS, Forecaster, LandmarkSequences, fit_forecaster
-from face_prediction.prediction.interface import Forecast, PictureNeeds, Predictor
-from face_prediction.tracking.detector import FaceDetection
+from face_prediction.prediction.interface import Forecast, ImageNeeds, Predictor
+from face_prediction.tracking.detector import FaceDetector
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import file_digest
@@ -31,74 +31,37 @@ DETECTOR_SIDE = 256
 """Images are enlarged to at least this side (pixels), the one that the detector's second network
 works at: what it does itself with a small image loses more (the mouth of 64-pixel crops is found
 within 0.002 of a crop instead of 0.006)."""
-_IMAGE_BYTES = 64 << 20
-"""Bytes of images that are given to a predictor at once."""
-_LANDMARK_BATCH = 64
-"""Histories at once where there are no images."""
+_IMAGE_BYTES = 64 << 20  # of images that are given to a predictor at once
+_LANDMARK_BATCH = 64  # histories at once where there are no images
 
 
 class BaselinePredictor:
     """Forecasts landmarks as ``forecaster`` does, and images as copies of the last one.
 
-    Args:
-        forecaster: a fitted baseline.
-        image_size: side of the images that are copied; 0: it makes none.
+    ``image_size`` is the side of the images; 0: it makes none.
     """
 
     def __init__(self, forecaster: Forecaster, image_size: int = 0) -> None:
-        self.forecaster = forecaster
-        self.name, self.memory = forecaster.name, forecaster.memory
-        self.needs = PictureNeeds(frames=1 if image_size else 0, size=image_size)
+        self.forecaster, self.name, self.memory = forecaster, forecaster.name, forecaster.memory
+        self.needs = ImageNeeds(frames=1 if image_size else 0, size=image_size)
 
     def predict(
-        self, landmarks: NDArray[np.floating], pictures: NDArray[np.uint8] | None, horizon: int
+        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
-        """Forecast ``horizon`` frames; see `Predictor`.
-
-        Raises:
-            RequestError: a shape is another one, or the horizon is 0 or less.
-        """
+        """Forecast ``horizon`` frames; see `Predictor`."""
         if landmarks.ndim != 4:
             raise RequestError(f"landmarks of shape {landmarks.shape}; expected (B, T, 468, 2)")
         forecast = self.forecaster.predict(landmarks, horizon).astype(np.float32, copy=False)
         if not self.needs.frames:
             return Forecast(forecast)
         expected = (len(landmarks), 1, self.needs.size, self.needs.size, 3)
-        if pictures is None or pictures.shape != expected:
-            given = None if pictures is None else pictures.shape
+        if images is None or images.shape != expected:
+            given = None if images is None else images.shape
             raise RequestError(f"{self.name}: images of shape {given}; expected {expected}")
-        return Forecast(forecast, np.repeat(pictures, horizon, axis=1))
+        return Forecast(forecast, np.repeat(images, horizon, axis=1))
 
 
-class LandmarkDetector(Protocol):
-    """Interface of `face_prediction.tracking.detector.FaceDetector` that is used here."""
-
-    def detect(self, image: np.ndarray, time: float) -> list[FaceDetection]:
-        """Faces in ``image`` (H, W, 3) uint8 RGB."""
-        ...
-
-
-class DetectedPredictor:
-    """A predictor of images only, with the landmarks that a detector finds in them.
-
-    Where no face is found the landmarks are NaN: a missing forecast.
-    """
-
-    def __init__(self, predictor: Predictor, detector: LandmarkDetector) -> None:
-        self.name, self.memory, self.needs = predictor.name, predictor.memory, predictor.needs
-        self._predictor, self._detector = predictor, detector
-
-    def predict(
-        self, landmarks: NDArray[np.floating], pictures: NDArray[np.uint8] | None, horizon: int
-    ) -> Forecast:
-        """Forecast images, and find the face in each; see `Predictor`."""
-        forecast = self._predictor.predict(landmarks, pictures, horizon)
-        if forecast.pictures is None:
-            return forecast
-        return replace(forecast, landmarks=find_landmarks(forecast.pictures, self._detector))
-
-
-def find_landmarks(images: NDArray[np.uint8], detector: LandmarkDetector) -> NDArray[np.float32]:
+def find_landmarks(images: NDArray[np.uint8], detector: FaceDetector) -> NDArray[np.float32]:
     """Landmarks (B, H, L, 2) in images (B, H, S, S, 3), normalised to them; NaN without a face.
 
     Of several faces the largest counts.
@@ -119,11 +82,9 @@ def find_landmarks(images: NDArray[np.uint8], detector: LandmarkDetector) -> NDA
 
 @dataclass(frozen=True)
 class FittedPredictor:
-    """A predictor, and everyone whose footage shaped it.
+    """A predictor, and the ``subjects`` whose footage shaped it.
 
     Attributes:
-        predictor: forecasts.
-        subjects: people that it was fitted to.
         folder: of a trained network.
         checkpoint: of a trained network, as in ``results.json``: folder, name, preset, test fold,
             number of subjects, SHA-256 of the weights.
@@ -144,15 +105,17 @@ class EvaluatedPredictor:
         by_fold: for each fold the one that was fitted without its people.
         role: kind of row in the tables.
         image_size: side of the images that it forecasts; 0: none.
+        detector: finds the landmarks in its images, if it forecasts no others.
     """
 
     name: str
     by_fold: Mapping[int, FittedPredictor]
     role: Role = "network"
     image_size: int = 0
+    detector: FaceDetector | None = None
 
     @property
-    def needs(self) -> list[PictureNeeds]:
+    def needs(self) -> list[ImageNeeds]:
         """Images that it needs, for each fold."""
         return [fitted.predictor.needs for fitted in self.by_fold.values()]
 
@@ -189,6 +152,8 @@ class EvaluatedPredictor:
         predictor, *_ = [self.predictor_for(row.fold, row.subject) for row in rows]
         expected = batch.future.shape
         forecast = predictor.predict(batch.history, batch.images(predictor.needs), expected[1])
+        if self.detector is not None and forecast.images is not None:
+            forecast = replace(forecast, landmarks=find_landmarks(forecast.images, self.detector))
         if forecast.landmarks.shape != expected:
             raise RequestError(
                 f"{self.name}: landmarks of shape {forecast.landmarks.shape}; expected {expected}"
@@ -244,12 +209,12 @@ def load_network(folder: Path, dataset_sha256: str) -> FittedPredictor:
     record = {
         "folder": folder.resolve().name,
         "name": network.name,
-        "preset": network.preset,
+        "preset": network.record.preset,
         "test_fold": network.test_fold,
-        "train_subjects": len(network.train_subjects),
+        "train_subjects": len(network.record.train_subjects),
         "sha256": file_digest(folder / "model.safetensors"),
     }
-    return FittedPredictor(network, frozenset(network.train_subjects), folder, record)
+    return FittedPredictor(network, frozenset(network.record.train_subjects), folder, record)
 
 
 def group_networks(loaded: Sequence[FittedPredictor]) -> list[EvaluatedPredictor]:
@@ -283,7 +248,7 @@ def fit_baselines(
     # copies of u and v: a view would keep the depth in memory, too
     frames = [dataset.landmarks(index)[..., :2].copy() for index in range(len(dataset))]
     for fold in folds:
-        known = dataset.indices(folds=set(range(dataset.manifest.folds)) - {fold}).tolist()
+        known = dataset.indices(folds={*range(dataset.manifest.folds)} - {fold}).tolist()
         if not known:
             raise RequestError(
                 f"{dataset.folder}: all its people are in fold {fold}, so nobody is left to fit "
@@ -297,7 +262,7 @@ def fit_baselines(
     return [EvaluatedPredictor(name, fitted, "baseline") for name, fitted in by_fold.items()]
 
 
-def batch_size(needs: PictureNeeds) -> int:
+def batch_size(needs: ImageNeeds) -> int:
     """Number of histories to forecast at once."""
     one = needs.frames * needs.size**2 * 3
     return _LANDMARK_BATCH if one == 0 else int(np.clip(_IMAGE_BYTES // one, 1, _LANDMARK_BATCH))

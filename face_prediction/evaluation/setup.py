@@ -12,26 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch, reduction
+from face_prediction.dataset.image_batches import SequenceBatch, reduction
 from face_prediction.dataset.manifest import SequenceRow
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation.predictors import (
     BaselinePredictor,
-    DetectedPredictor,
     EvaluatedPredictor,
     FittedPredictor,
-    LandmarkDetector,
 )
-from face_prediction.prediction.interface import Predictor
+from face_prediction.tracking.detector import FaceDetector
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.seeds import stream_generator
 from robo_manip_baselines.runs.versions import software_versions
 
 PERSISTENCE = "persistence"
 """The baseline that skill is measured against; its images are copies of the last one."""
-PACKAGES = (
-    "numpy", "scipy", "scikit-image", "torch", "mediapipe", "opencv-python-headless", "h5py",
-)  # fmt: skip
+DEPENDS = ("numpy", "scipy", "scikit-image", "torch", "mediapipe", "opencv-python-headless", "h5py")
 """Packages that the numbers may depend on."""
 
 
@@ -61,11 +57,8 @@ class SequenceSelection:
     def batches(self, size: int) -> list[NDArray[np.intp]]:
         """Places of sequences to forecast at once: ``size`` or fewer of one fold."""
         folds = np.array([row.fold for row in self.rows])
-        result: list[NDArray[np.intp]] = []
-        for fold in np.unique(folds):
-            places = np.flatnonzero(folds == fold)
-            result += [places[i : i + size] for i in range(0, len(places), size)]
-        return result
+        of_folds = [np.flatnonzero(folds == fold) for fold in np.unique(folds)]
+        return [places[i : i + size] for places in of_folds for i in range(0, len(places), size)]
 
 
 def select_sequences(
@@ -151,13 +144,12 @@ def require_unseen(dataset: FaceDataset, predictors: Sequence[EvaluatedPredictor
     Raises:
         RequestError: a predictor is for a fold that is not there, or learnt from somebody in it.
     """
-    folds = range(dataset.manifest.folds)
+    last = dataset.manifest.folds - 1
     for predictor in predictors:
         for fold in predictor.by_fold:
-            if fold not in folds:
+            if not 0 <= fold <= last:
                 raise RequestError(
-                    f"{predictor.name} is for fold {fold}; {dataset.folder} has folds 0 to "
-                    f"{folds[-1]}"
+                    f"{predictor.name} is for fold {fold}; {dataset.folder} has folds 0 to {last}"
                 )
         for clip in dataset.manifest.clips:
             if clip.sequences and clip.fold in predictor.by_fold:
@@ -182,7 +174,7 @@ class EvaluationSetup:
     selection: SequenceSelection
     predictors: tuple[EvaluatedPredictor, ...]
     common_size: int
-    detector: LandmarkDetector | None = None
+    detector: FaceDetector | None = None
     detected_size: int = 0
 
     @property
@@ -193,18 +185,15 @@ class EvaluationSetup:
     @property
     def image_networks(self) -> list[EvaluatedPredictor]:
         """The networks that look at images."""
-        return [
-            predictor
-            for predictor in self.predictors
-            if predictor.role == "network" and any(needs.frames for needs in predictor.needs)
-        ]
+        networks = (predictor for predictor in self.predictors if predictor.role == "network")
+        return [network for network in networks if any(needs.frames for needs in network.needs)]
 
 
 def prepare_evaluation(
     dataset: FaceDataset,
     selection: SequenceSelection,
     predictors: Sequence[EvaluatedPredictor],
-    open_detector: Callable[[], LandmarkDetector],
+    open_detector: Callable[[], FaceDetector],
 ) -> EvaluationSetup:
     """Find out from one sequence what each predictor forecasts.
 
@@ -218,36 +207,27 @@ def prepare_evaluation(
     sizes: dict[str, int] = {}
     without_landmarks: set[str] = set()
     for predictor in predictors:
-        batch = SequenceBatch(dataset, [int(selection.indices[0])], ImagePlan.of(predictor.needs))
+        batch = SequenceBatch(dataset, [int(selection.indices[0])], predictor.needs)
         forecast = predictor.forecast(selection.rows[:1], batch)
-        if forecast.pictures is not None:
-            sizes[predictor.name] = forecast.pictures.shape[2]
+        if forecast.images is not None:
+            sizes[predictor.name] = forecast.images.shape[2]
             reduction(crop_size, sizes[predictor.name])
             if np.isnan(forecast.landmarks).all():
                 without_landmarks.add(predictor.name)
     common_size = sizes[PERSISTENCE] = min(sizes.values(), default=crop_size)
     detector = open_detector() if without_landmarks else None
-
-    def completed(name: str, predictor: Predictor) -> Predictor:
-        if name == PERSISTENCE and isinstance(predictor, BaselinePredictor):
-            return BaselinePredictor(predictor.forecaster, common_size)
-        if name in without_landmarks and detector is not None:
-            return DetectedPredictor(predictor, detector)
-        return predictor
-
-    ready = tuple(
-        replace(
-            predictor,
-            image_size=sizes.get(predictor.name, 0),
-            by_fold={
-                fold: replace(fitted, predictor=completed(predictor.name, fitted.predictor))
-                for fold, fitted in predictor.by_fold.items()
-            },
-        )
-        for predictor in predictors
-    )
+    ready: list[EvaluatedPredictor] = []
+    for row in predictors:
+        by_fold = dict(row.by_fold)
+        for fold, fitted in by_fold.items():
+            if row.name == PERSISTENCE and isinstance(fitted.predictor, BaselinePredictor):
+                copying = BaselinePredictor(fitted.predictor.forecaster, common_size)
+                by_fold[fold] = replace(fitted, predictor=copying)
+        finder = detector if row.name in without_landmarks else None
+        size = sizes.get(row.name, 0)
+        ready.append(replace(row, by_fold=by_fold, image_size=size, detector=finder))
     largest = max((sizes[name] for name in without_landmarks), default=0)
-    return EvaluationSetup(dataset, selection, ready, common_size, detector, largest)
+    return EvaluationSetup(dataset, selection, tuple(ready), common_size, detector, largest)
 
 
 def provenance(
@@ -257,17 +237,16 @@ def provenance(
     options: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The part of ``results.json`` that names dataset, checkpoints, options and versions."""
-    manifest = dataset.manifest
     versions = software_versions()
-    for name in PACKAGES:
+    for name in DEPENDS:
         with suppress(PackageNotFoundError):  # some are needed by some predictors only
             versions |= software_versions(name)
     return {
         "dataset": {
             "sha256": dataset_sha256,
-            "folds": manifest.folds,
+            "folds": dataset.manifest.folds,
             "sequences": len(dataset),
-            "settings": manifest.settings.to_json(),
+            "settings": dataset.manifest.settings.to_json(),
         },
         "checkpoints": [fitted.checkpoint for fitted in loaded],
         "options": dict(options),
@@ -282,16 +261,14 @@ def notes_on_selection(
     max_sequences: int | None,
 ) -> list[str]:
     """Sentences for readers of the tables about what was left out."""
-    result: list[str] = []
+    result = []
     if len(folds) < all_folds:
         result.append(f"{len(folds)} of the dataset's {all_folds} folds are reported on.")
     for network in networks:
         more = [str(fold) for fold in network.by_fold if fold not in folds]
         if more:
-            result.append(
-                f"{network.name} also has fold {', '.join(more)}, which not every network has; "
-                "left out."
-            )
+            also = f"{network.name} also has fold {', '.join(more)}"
+            result.append(f"{also}, which not every network has; left out.")
     if max_sequences is not None:
         result.append(f"Of each kind at most {max_sequences} sequences, drawn at random.")
     return result

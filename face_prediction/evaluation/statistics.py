@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.evaluation.errors import coverage
 from face_prediction.evaluation.predictors import Role
-from face_prediction.evaluation.scoring import EvaluationScores
+from face_prediction.evaluation.scoring import EvaluationScores, coverage
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.prediction.errors import mouth_distances
 from robo_manip_baselines.runs.errors import RequestError
@@ -42,43 +41,10 @@ class BootstrapEstimate:
     high: Floats
 
 
-def bootstrap_mean(
-    values: NDArray[np.floating],
-    subjects: Sequence[str],
-    *,
-    level: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> BootstrapEstimate:
-    """Mean of ``values`` (N, ...), NaN left out, with its interval over people and sequences.
+def resample_counts(subjects: Sequence[str], resamples: int, seed: int) -> Floats:
+    """Number of times (W, N) that each sequence is in each of ``resamples``, drawn from ``seed``.
 
-    Args:
-        values: one row a sequence. Models that are compared stand side by side in a row, so that
-            every resample holds the same sequences of both.
-        subjects: N names.
-        level: share of resamples inside the interval.
-        resamples: number of them.
-        seed: of the resampling.
-
-    Raises:
-        RequestError: no rows, not one subject a row, or a level or number out of range.
-    """
-    if len(values) == 0 or len(values) != len(subjects):
-        raise RequestError(f"{len(subjects)} subjects for {len(values)} sequences; one for each")
-    if not 0 < level < 1:
-        raise RequestError(f"level {level}; must be between 0 and 1")
-    counts = resample_counts(subjects, resamples=resamples, seed=seed)
-    (mean,) = _mean(values, np.ones((1, len(values))))
-    return BootstrapEstimate(mean, *_percentile_bounds(_mean(values, counts), level))
-
-
-def resample_counts(subjects: Sequence[str], *, resamples: int = 2000, seed: int = 0) -> Floats:
-    """Number of times (W, N) that each sequence is in each resample.
-
-    Args:
-        subjects: N names.
-        resamples: number of them.
-        seed: of the resampling.
+    Models that are compared have the same sequences in every resample.
 
     Raises:
         RequestError: no rows, or a number out of range.
@@ -102,11 +68,9 @@ def resample_counts(subjects: Sequence[str], *, resamples: int = 2000, seed: int
 
 @dataclass(frozen=True)
 class RowSummary:
-    """One row of the tables, beside its numbers.
+    """One row of the tables, beside its numbers: name and role of the predictor.
 
     Attributes:
-        name: of the predictor.
-        role: of the predictor.
         image_size: side of the images that it makes; 0: none.
         missing: (H,) frames without a forecast.
         has_intervals: it gives intervals.
@@ -158,13 +122,7 @@ class KindSummary:
 def summarise_kind(
     scores: EvaluationScores, kind: str, *, seed: int = 0, resamples: int = 2000
 ) -> KindSummary:
-    """The numbers of one kind of footage.
-
-    Args:
-        scores: of every row on N sequences.
-        kind: of the sequences that count.
-        seed: of the bootstrap.
-        resamples: of the bootstrap.
+    """The numbers of one kind of footage; ``seed`` and number of ``resamples`` of the bootstrap.
 
     Raises:
         RequestError: there is no sequence of that kind, or too short a horizon.
@@ -186,14 +144,13 @@ def summarise_kind(
 
     footage = scores.selection.rows_at(places)
     subjects = [row.subject for row in footage]
-    counts = resample_counts(subjects, resamples=resamples, seed=seed)
-    whole, *parts = (
-        _numbers(data, weight, reference, best)
-        for weight in (
-            np.ones((1, len(places))),
-            *(counts[i : i + _AT_ONCE] for i in range(0, resamples, _AT_ONCE)),
-        )
-    )
+    counts = resample_counts(subjects, resamples, seed)
+    whole = _numbers(data, np.ones((1, len(places))), reference, best)
+    parts = [
+        _numbers(data, counts[i : i + _AT_ONCE], reference, best)
+        for i in range(0, resamples, _AT_ONCE)
+    ]
+    drawn = {name: np.concatenate([part[name] for part in parts]) for name in whole}
     return KindSummary(
         kind=kind,
         sequences=len(places),
@@ -212,9 +169,7 @@ def summarise_kind(
         ),
         best_baseline=rows[best].name,
         numbers={
-            name: BootstrapEstimate(
-                value, *_percentile_bounds(np.concatenate([part[name] for part in parts]))
-            )
+            name: BootstrapEstimate(value, *percentile_bounds(drawn[name]))
             for name, (value,) in whole.items()
         },
     )
@@ -251,12 +206,12 @@ def _numbers(
     result: dict[str, Floats] = {}
     absolute, distance = data["absolute"], data["distance"]
     for prefix, frames in (("", None), ("pooled_", 2)):
-        mean = _mean(absolute, weight, frames)
-        square = _mean(absolute**2, weight, frames)
+        mean = weighted_mean(absolute, weight, frames)
+        square = weighted_mean(absolute**2, weight, frames)
         result[f"{prefix}mean"] = mean
         result[f"{prefix}variance"] = np.maximum(square - mean**2, 0.0)
         for name in (*AVERAGED, "coverage"):
-            result[f"{prefix}{name}"] = _mean(data[name], weight, frames)
+            result[f"{prefix}{name}"] = weighted_mean(data[name], weight, frames)
     persistence, baseline = (
         np.broadcast_to(distance[:, [row]], distance.shape) for row in (reference, best)
     )
@@ -272,7 +227,7 @@ def _numbers(
     return result
 
 
-def _mean(values: NDArray[np.floating], weight: Floats, frames: int | None = None) -> Floats:
+def weighted_mean(values: Floats, weight: Floats, frames: int | None = None) -> Floats:
     """Weighted mean of (N, ...) over sequences, and axis ``frames`` if given; without NaN."""
     total, count = _sums(values, ~np.isnan(values), weight, frames)
     return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
@@ -281,8 +236,7 @@ def _mean(values: NDArray[np.floating], weight: Floats, frames: int | None = Non
 def _ratio(ours: Floats, theirs: Floats, weight: Floats, frames: int | None) -> Floats:
     """Sum of ours / sum of theirs, where both are; NaN where theirs is without error."""
     both = ~(np.isnan(ours) | np.isnan(theirs))
-    mine, _ = _sums(ours, both, weight, frames)
-    other, _ = _sums(theirs, both, weight, frames)
+    mine, other = (_sums(values, both, weight, frames)[0] for values in (ours, theirs))
     return np.divide(mine, other, out=np.full_like(mine, np.nan), where=other > 0)
 
 
@@ -297,7 +251,7 @@ def _sums(
     return np.tensordot(weight, total, axes=1), np.tensordot(weight, count, axes=1)
 
 
-def _percentile_bounds(drawn: Floats, level: float = 0.95) -> tuple[Floats, Floats]:
+def percentile_bounds(drawn: Floats, level: float = 0.95) -> tuple[Floats, Floats]:
     """Lower and upper bounds (...) of the middle ``level`` of resampled statistics (W, ...).
 
     NaN where no resample has a number.

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from face_prediction.evaluation.error_stats import compact_json
-from face_prediction.evaluation.errors import LEVELS
+from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
 from robo_manip_baselines.runs.files import write_text
@@ -54,8 +54,7 @@ PER_FRAME: tuple[tuple[str, str, tuple[Any, ...], Format], ...] = (
     ("SSIM", "ssim", (), _ssim),
 )
 """Metrics of Table II: heading, key of `KindSummary.numbers`, axis U or V, format."""
-TABULATED_LEVELS = (0.5, 0.9)
-"""Nominal coverages in the tables."""
+TABULATED_LEVELS = (0.5, 0.9)  # nominal coverages
 INTRODUCTION = """Everybody is forecast by predictors that never saw the person. Errors are of the
 mouth centre (mean of the lip landmarks), as shares of the crop; a frame without a forecast is
 missing and enters no mean. In brackets: 95 % intervals from resampling people, and sequences within
@@ -149,60 +148,45 @@ def markdown_table_1(summary: KindSummary) -> str:
 
 def results_json(report: EvaluationReport) -> str:
     """``results.json``: every number, and the provenance."""
-    return compact_json(
-        {
-            "schema": SCHEMA,
-            "version": VERSION,
-            **report.provenance,
-            "history": report.history,
-            "folds": report.folds,
-            "coverage_levels": LEVELS,
-            "horizon_groups": GROUPS,
-            "kinds": {summary.kind: _kind_record(summary) for summary in report.kinds},
-        }
-    )
+    record = {"schema": SCHEMA, "version": VERSION, **report.provenance}
+    record |= {"history": report.history, "folds": report.folds}
+    record |= {"coverage_levels": LEVELS, "horizon_groups": GROUPS}
+    kinds = {summary.kind: _kind_record(summary) for summary in report.kinds}
+    return compact_json(record | {"kinds": kinds})
 
 
 def _kind_sections(summary: KindSummary, history: int) -> list[str]:
     """Sections on one kind of footage; ``history`` frames are seen, so that 71 is the next."""
     people = "person" if summary.subjects == 1 else "people"
-    rows = dict(enumerate(summary.rows))
+    rows, best = dict(enumerate(summary.rows)), summary.best_baseline
     frames = [str(history + h + 1) for h in range(summary.horizon)]
     spans = [f"{history + first}–{history + last}" for first, last in GROUPS]
     groups = [f"frames {span}" for span in spans]
+    by_frame = ["", *frames, "all"]
 
     def table(head: Sequence[str], chosen: Iterable[int], *columns: Column) -> str:
         return _table(head, ([rows[i].name, *_cells(summary, i, columns)] for i in chosen))
 
     forecasts = [i for i, row in rows.items() if row.role != "reference"]
-    parts = [
-        f"## {summary.kind}: {summary.sequences} sequences of {summary.subjects} {people}, "
-        f"{summary.clips} clips"
-    ]
+    count = f"{summary.sequences} sequences of {summary.subjects} {people}"
+    parts = [f"## {summary.kind}: {count}, {summary.clips} clips"]
     if summary.subjects < 5:
         parts.append(f"With {summary.subjects} {people} the intervals say little about others.")
     parts += [
         "### Table I: errors of the mouth centre in crops, and SSIM",
         markdown_table_1(summary),
         "### Distance between forecast and true mouth centre, in crops",
-        table(
-            ["", *frames, "all"],
-            rows,
-            ("distance", (), _error, "–"),
-            ("pooled_distance", (), _error, "–"),
-        ),
+        table(by_frame, rows, ("distance", (), _error, "–"), ("pooled_distance", (), _error, "–")),
         "### Skill: 1 − mean distance / that of persistence",
         table(
-            ["", *frames, "all"],
+            by_frame,
             [i for i in forecasts if rows[i].name != PERSISTENCE],
-            ("skill", (), _skill, None),
-            ("pooled_skill", (), _skill, " to "),
+            *(("skill", (), _skill, None), ("pooled_skill", (), _skill, " to ")),
         ),
-        f"### Mean distance against {summary.best_baseline}, the best baseline at frames "
-        f"{spans[1]}",
+        f"### Mean distance against {best}, the best baseline at frames {spans[1]}",
         table(
             ["", *groups],
-            [i for i in forecasts if rows[i].name != summary.best_baseline],
+            [i for i in forecasts if rows[i].name != best],
             ("difference", (), _percent, " to "),
         ),
         "### Table II: by forecast frame",
@@ -222,7 +206,7 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
             cells.append([f"{row.name}, {level:.0%}", *_cells(summary, i, columns)])
     if cells:
         parts.append("### Coverage of the mouth centre's intervals, U and V together, in percent")
-        parts.append(_table(["", *frames, "all"], cells))
+        parts.append(_table(by_frame, cells))
     shuffled = [i for i in rows if not np.isnan(summary.numbers["exchanged"].value[i]).all()]
     if shuffled:
         parts.append("### Mean distance with another sequence's images against with its own")
@@ -245,9 +229,8 @@ def _cells(summary: KindSummary, row: int, columns: Iterable[Column]) -> list[st
 def _bounded(summary: KindSummary, key: str, place: tuple[Any, ...]) -> np.ndarray:
     """Values with their bounds (n, 3)."""
     number = summary.numbers[key]
-    return np.stack(
-        [np.ravel(part[place]) for part in (number.value, number.low, number.high)], axis=-1
-    )
+    parts = (number.value, number.low, number.high)
+    return np.stack([np.ravel(part[place]) for part in parts], axis=-1)
 
 
 def _share(value: float) -> str:
@@ -316,29 +299,22 @@ def _csv(lines: Iterable[Iterable[Any]]) -> str:
 
 
 def _kind_record(summary: KindSummary) -> dict[str, Any]:
+    rows: list[dict[str, Any]] = []
+    for i, row in enumerate(summary.rows):
+        numbers = {
+            key: {part: _rounded(values[i].tolist()) for part, values in vars(number).items()}
+            for key, number in summary.numbers.items()
+            if not np.isnan(number.value[i]).all()
+        }
+        record = {"name": row.name, "role": row.role, "picture_size": row.image_size}
+        rows.append(record | {"missing": row.missing.tolist(), "numbers": numbers})
     return {
         "sequences": summary.sequences,
         "subjects": summary.subjects,
         "clips": summary.clips,
         "ssim_size": summary.common_size,
         "best_baseline": summary.best_baseline,
-        "rows": [
-            {
-                "name": row.name,
-                "role": row.role,
-                "picture_size": row.image_size,
-                "missing": row.missing.tolist(),
-                "numbers": {
-                    key: {
-                        part: _rounded(getattr(number, part)[i].tolist())
-                        for part in ("value", "low", "high")
-                    }
-                    for key, number in summary.numbers.items()
-                    if not np.isnan(number.value[i]).all()
-                },
-            }
-            for i, row in enumerate(summary.rows)
-        ],
+        "rows": rows,
     }
 
 

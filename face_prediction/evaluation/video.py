@@ -35,22 +35,14 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-LEAD = 20
-"""Frames before the first forecast, so that it does not come at once."""
-LONGEST = 6.0
-"""Seconds of a clip in the video, at most."""
-SLOWED = 3
-"""Seconds that a second of footage takes, so that five frames can be followed by eye."""
-PAUSE = 6
-"""Images for which a new forecast stands still, unless there is one at almost every frame."""
-SIZE = (1280, 560)
-"""Pixels of the video: width and height, both even."""
-VIEW = 0.55
-"""Share of the crop that the image of the face covers, around the mouth."""
-TRUTH, TRUTH_ON_IMAGE = (0, 0, 0), (255, 255, 255)
-"""Colours of the truth in the plots, and on the image of the face."""
-FORECASTS = ((230, 90, 0), (0, 114, 178))
-"""Colours of the forecasts: orange and blue."""
+LEAD = 20  # frames before the first forecast, so that it does not come at once
+LONGEST = 6.0  # seconds of a clip in the video, at most
+SLOWED = 3  # seconds that a second of footage takes, so that five frames can be followed by eye
+PAUSE = 6  # images for which a forecast stands still, unless there is one at almost every frame
+SIZE = (1280, 560)  # pixels of the video: width and height, both even
+VIEW = 0.55  # share of the crop that the image of the face covers, around the mouth
+TRUTH, TRUTH_ON_IMAGE = (0, 0, 0), (255, 255, 255)  # in the plots, and on the image of the face
+FORECASTS = ((230, 90, 0), (0, 114, 178))  # orange and blue
 _CLOCK = 90_000  # ticks a second of the times in a file, as cameras and broadcasts have it
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
@@ -137,9 +129,7 @@ class ForecastTimeline:
     """Truth and forecasts along a clip; places are pixels of the clip's own images.
 
     Attributes:
-        clip: name.
-        frames: (T,) frame numbers, increasing.
-        fps: frames a second.
+        frames: (T,) frame numbers in the clip, increasing; ``fps`` a second.
         mouth: (T, 2) true mouth centre.
         images: T of (S, S, 3) uint8, as the dataset holds them.
         crops: T, the part of the clip's image that each image is.
@@ -156,12 +146,6 @@ class ForecastTimeline:
     forecasts: Sequence[tuple[str, Floats]]
     origins: NDArray[np.int64]
 
-    @property
-    def is_dense(self) -> bool:
-        """A new forecast comes before the last one has been caught up with."""
-        horizon = self.forecasts[0][1].shape[1]
-        return len(self.origins) > 1 and bool(np.diff(self.origins).min() < horizon)
-
 
 def forecast_timeline(
     dataset: FaceDataset, indices: Sequence[int], residuals: Sequence[tuple[str, Floats]]
@@ -169,7 +153,7 @@ def forecast_timeline(
     """The timeline of sequences that follow one another in a clip.
 
     Args:
-        dataset: open.
+        dataset: open for reading.
         indices: W sequences, each beginning the stride after the one before it.
         residuals: name and errors (W, H, 2) in crops of each predictor.
     """
@@ -180,12 +164,8 @@ def forecast_timeline(
         corners = read_array(path, file, "sequences/crop")
         starts = read_array(path, file, "sequences/start")
     first = next(i for i in range(len(dataset)) if dataset.entry(i).clip == clip)
-    frames: list[int] = []
-    mouth: list[Floats] = []
-    images: list[Image] = []
-    crops: list[Crop] = []
+    frames, mouth, images, crops, origins = [], [], [], [], []
     forecasts = [(name, np.empty_like(errors)) for name, errors in residuals]
-    origins: list[int] = []
     for place, index in enumerate(indices):
         crop = Crop(*map(int, corners[index - first]))
         start = int(starts[index - first])
@@ -198,18 +178,10 @@ def forecast_timeline(
         end = settings.length if place == len(indices) - 1 else settings.history
         frames += range(start + begin, start + end)
         mouth += list(centres[begin:end])
-        images += list(dataset.pictures(index, slice(begin, end)))
+        images += list(dataset.images(index, slice(begin, end)))
         crops += [crop] * (end - begin)
-    return ForecastTimeline(
-        clip=clip,
-        frames=np.array(frames),
-        fps=settings.fps,
-        mouth=np.stack(mouth),
-        images=images,
-        crops=crops,
-        forecasts=forecasts,
-        origins=np.array(origins),
-    )
+    seen = (np.array(frames), settings.fps, np.stack(mouth), images, crops)
+    return ForecastTimeline(clip, *seen, forecasts, np.array(origins))
 
 
 def write_forecast_video(
@@ -238,12 +210,12 @@ def write_forecast_video(
 
 def timeline_images(timeline: ForecastTimeline) -> Iterator[Image]:
     """The images (560, 1280, 3) of the video: one for each of T frames, and the pauses."""
-    stage = _Stage(timeline)
+    stage, horizon = _Stage(timeline), timeline.forecasts[0][1].shape[1]
+    # a new forecast comes before the last one has been caught up with
+    is_dense = np.any(np.diff(timeline.origins) < horizon)
     for number, frame in enumerate(timeline.frames.tolist()):
         image = stage.draw(number)
-        yield image
-        for _ in range(PAUSE if frame in timeline.origins and not timeline.is_dense else 0):
-            yield image
+        yield from [image] * (1 + PAUSE * (frame in timeline.origins and not is_dense))
 
 
 class _Stage:
@@ -254,9 +226,7 @@ class _Stage:
         figure = new_matplotlib_figure(SIZE[0] / 100, SIZE[1] / 100)
         grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.4))
         face = figure.add_subplot(grid[:, 0])
-        face.set_aspect("equal")
-        face.set_xticks([])
-        face.set_yticks([])
+        face.set(aspect="equal", xticks=[], yticks=[])
         face.set_title(f"{timeline.clip}, {SLOWED} times slower", fontsize=13)
         seconds = timeline.frames / timeline.fps
         plots: list[Any] = []
@@ -298,13 +268,11 @@ class _Stage:
         """The image at frame ``number``: nothing on it is later, but the forecasts."""
         timeline = self.timeline
         image, face = self.background.copy(), self._face(number)
-        self._path(face, self._on_face(timeline.mouth[max(0, number - LEAD) : number + 1]),
-                   TRUTH_ON_IMAGE)  # fmt: skip
+        past = timeline.mouth[max(0, number - LEAD) : number + 1]
+        self._path(face, self._on_face(past), TRUTH_ON_IMAGE)
         made = np.flatnonzero(timeline.origins <= timeline.frames[number]).tolist()
-        # the first, drawn last, is on top
-        for (_, forecasts), colour in reversed(
-            list(zip(timeline.forecasts, FORECASTS, strict=False))
-        ):
+        pairs = list(zip(timeline.forecasts, FORECASTS, strict=False))
+        for (_, forecasts), colour in reversed(pairs):  # the first, drawn last, is on top
             for k in made:
                 origin = timeline.origins[k]
                 begin = timeline.mouth[timeline.frames == origin][:1]
@@ -318,9 +286,8 @@ class _Stage:
                     for point in on_face[1:]:
                         self._dot(face, point, colour, 4)
         for axis in range(2):
-            points = self._on_plot(
-                axis, timeline.frames[: number + 1], timeline.mouth[: number + 1, axis]
-            )
+            seen = slice(number + 1)
+            points = self._on_plot(axis, timeline.frames[seen], timeline.mouth[seen, axis])
             self._path(image, points, TRUTH)
             self._dot(image, points[-1], TRUTH, 4)
         self._dot(face, self._on_face(timeline.mouth[number]), TRUTH_ON_IMAGE, 5)
@@ -377,5 +344,5 @@ def _lively_run(scores: EvaluationScores, kind: str, stride: int, fps: float) ->
     longest = max(map(len, parts))
     candidates = [places[part] for part in parts if len(part) == longest]
     size = mouth_distances(scores.row(PERSISTENCE).residuals)
-    order = sorted(candidates, key=lambda part: float(size[part].mean()))
-    return order[int(0.75 * (len(order) - 1))]
+    candidates.sort(key=lambda part: float(size[part].mean()))
+    return candidates[int(0.75 * (len(candidates) - 1))]

@@ -48,7 +48,7 @@ def fit_forecaster(name: str, sequences: LandmarkSequences) -> Forecaster:
     Raises:
         RequestError: there is none of that name, or the sequences do not suit it.
     """
-    return FORECASTERS[_require_name(name)].fit(sequences)
+    return FORECASTERS[require_choice("forecaster", name, FORECASTERS)].fit(sequences)
 
 
 def restore_forecaster(name: str, arrays: Mapping[str, NDArray[Any]]) -> Forecaster:
@@ -57,8 +57,4 @@ def restore_forecaster(name: str, arrays: Mapping[str, NDArray[Any]]) -> Forecas
     Raises:
         RequestError: there is none of that name, or the arrays are not its own.
     """
-    return FORECASTERS[_require_name(name)].from_arrays(arrays)
-
-
-def _require_name(name: str) -> str:
-    return require_choice("forecaster", name, FORECASTERS)
+    return FORECASTERS[require_choice("forecaster", name, FORECASTERS)].from_arrays(arrays)

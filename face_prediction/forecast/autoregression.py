@@ -57,10 +57,8 @@ def moments(series: Floats, order: int) -> Floats:
     the third axis) and with the values 1...P frames ago.
     """
     size, components = series.shape[1:]
-    lagged = np.stack(
-        [series[:, order - k : size - k] for k in range(1, order + 1)], axis=2
-    )  # (N, T - P, P, D)
-    rows = lagged.reshape(-1, order * components)
+    lagged = [series[:, order - k : size - k] for k in range(1, order + 1)]  # P of (N, T - P, D)
+    rows = np.stack(lagged, axis=2).reshape(-1, order * components)
     target = series[:, order:].reshape(-1, components)
     shape = (order, components, -1, components)
     products = [(rows.T @ columns).reshape(shape) for columns in (target, rows)]
@@ -134,16 +132,12 @@ def held_out_errors(
     """
     longest = max(order for order, _ in candidates)
     if len(set(subjects)) < 2:
-        raise RequestError(
-            "sequences of 1 subject; an order is chosen on people held out: give 2 or more "
-            "subjects, or the order"
-        )
+        needed = "an order is chosen on people held out: give 2 or more subjects, or the order"
+        raise RequestError(f"sequences of 1 subject; {needed}")
     steps = series.shape[1]
     if steps - horizon < longest:
-        raise RequestError(
-            f"sequences of {steps + 1} frames; order {longest} and horizon {horizon} need "
-            f"{longest + horizon + 1} or more"
-        )
+        needed = f"order {longest} and horizon {horizon} need {longest + horizon + 1} or more"
+        raise RequestError(f"sequences of {steps + 1} frames; {needed}")
     # ends of histories, the last first, each with ``horizon`` steps after it
     origins = range(steps - horizon, longest - 1, -_ORIGIN_STEP)[:_ORIGINS]
     fold = subject_folds(subjects, FOLDS)
@@ -172,9 +166,8 @@ def least_error(errors: Mapping[tuple[int, int], float]) -> tuple[int, int]:
 def require_order(order: int, steps: int) -> None:
     """Raise RequestError unless ``steps`` displacements a sequence leave rows to fit ``order``."""
     if not 1 <= order < steps:
-        raise RequestError(
-            f"order {order}: must be 1 to {steps - 1} for sequences of {steps + 1} frames"
-        )
+        needed = f"must be 1 to {steps - 1} for sequences of {steps + 1} frames"
+        raise RequestError(f"order {order}: {needed}")
 
 
 @dataclass(frozen=True)
@@ -189,9 +182,8 @@ class _Autoregression(Forecaster):
     def _check_coefficients(self, components: int) -> None:
         shape = self.coefficients.shape
         if len(shape) != 3 or shape[0] < 1 or shape[1:] != (components, components):
-            raise RequestError(
-                f"{self.name}: coefficients {shape}; expected (order, {components}, {components})"
-            )
+            expected = f"(order, {components}, {components})"
+            raise RequestError(f"{self.name}: coefficients {shape}; expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -246,9 +238,8 @@ class LandmarkAutoregression(_Autoregression):
         components = len(self.basis)
         self._check_coefficients(components)
         if self.basis.shape != (components, 2 * NUM_LANDMARKS):
-            raise RequestError(
-                f"{self.name}: basis {self.basis.shape}; expected (any, {2 * NUM_LANDMARKS})"
-            )
+            expected = f"(any, {2 * NUM_LANDMARKS})"
+            raise RequestError(f"{self.name}: basis {self.basis.shape}; expected {expected}")
 
     @classmethod
     def fit(

@@ -154,9 +154,9 @@ class KalmanConstantVelocity(Forecaster):
             RequestError: the sequences have fewer than 4 frames.
         """
         mouth = mouth_centre(sequences.landmarks)
-        if mouth.shape[1] < 4:
+        if (frames := mouth.shape[1]) < 4:
             raise RequestError(
-                f"kalman: sequences of {mouth.shape[1]} frames; 4 or more are needed to fit noise"
+                f"kalman: sequences of {frames} frames; 4 or more needed to fit noise"
             )
         q, r, v = np.array([fit_noise(mouth[..., axis]) for axis in range(2)]).T
         return cls(q, r, v)
@@ -213,11 +213,8 @@ def fit_noise(series: NDArray[np.float64]) -> tuple[float, float, float]:
 
     # where the mouth moves smoothly and the detector trembles, or the other way round
     starts = ([-2.0, 0.0], [0.0, 1.0])
-    fits = [
-        minimize(cost, start, method="Nelder-Mead", bounds=_BOUNDS, options={"xatol": 1e-3})
-        for start in starts
-    ]
-    best = min(fits, key=lambda fit: fit.fun)
+    how = {"method": "Nelder-Mead", "bounds": _BOUNDS, "options": {"xatol": 1e-3}}
+    best = min((minimize(cost, start, **how) for start in starts), key=lambda fit: fit.fun)
     q_ratio, v_ratio = 10.0**best.x
     r = max(_profile(series, q_ratio, v_ratio)[1], _SMALLEST_VARIANCE)
     return q_ratio * r, r, v_ratio * r

@@ -69,9 +69,8 @@ class LandmarkSequences:
     def __post_init__(self) -> None:
         shape = self.landmarks.shape
         if len(shape) != 4 or shape[2:] != (NUM_LANDMARKS, 2) or 0 in shape:
-            raise RequestError(
-                f"sequences of shape {shape}; expected (sequences, frames, {NUM_LANDMARKS}, 2)"
-            )
+            expected = f"(sequences, frames, {NUM_LANDMARKS}, 2)"
+            raise RequestError(f"sequences of shape {shape}; expected {expected}")
         if len(self.subjects) != shape[0]:
             raise RequestError(f"{len(self.subjects)} subjects for {shape[0]} sequences")
         _require_finite("sequences", self.landmarks)
@@ -117,9 +116,8 @@ class Forecaster(ABC):
         """
         history = np.asarray(history)
         if history.ndim < 3 or history.shape[-2:] != (NUM_LANDMARKS, 2):
-            raise RequestError(
-                f"history of shape {history.shape}; expected (..., frames, {NUM_LANDMARKS}, 2)"
-            )
+            expected = f"(..., frames, {NUM_LANDMARKS}, 2)"
+            raise RequestError(f"history of shape {history.shape}; expected {expected}")
         if history.shape[-3] < 1:
             raise RequestError("history of 0 frames; 1 or more are needed")
         if horizon < 1:
@@ -146,14 +144,10 @@ class Forecaster(ABC):
         """
         wanted = {field.name for field in fields(cls)}  # pyright: ignore[reportArgumentType]
         if set(arrays) != wanted:
-            raise RequestError(
-                f"{cls.name}: parameters {sorted(arrays)} stored, expected {sorted(wanted)}"
-            )
-        values = {
-            name: array.item() if np.ndim(array) == 0 else np.asarray(array)
-            for name, array in arrays.items()
-        }
-        return cls(**values)
+            stored = f"parameters {sorted(arrays)} stored"
+            raise RequestError(f"{cls.name}: {stored}, expected {sorted(wanted)}")
+        values = {name: np.asarray(array) for name, array in arrays.items()}
+        return cls(**{name: v if v.ndim else v.item() for name, v in values.items()})
 
 
 def _require_finite(what: str, values: Array) -> None:

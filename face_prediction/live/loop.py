@@ -1,21 +1,45 @@
-"""The live loop: detector, predictor and display in turn, with their times."""
+"""The live loop: detector, predictor and display in turn, with their times.
+
+The display is drawn over the image, in a window or an H.264 file. Images are RGB, (rows, columns,
+3) uint8. Legend: L landmarks, H horizon.
+"""
 
 from __future__ import annotations
 
+import os
+import re
+import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from face_prediction.live.display import GREEN, NEAR, WHITE, Colour, Show, draw_mouth, draw_text
+from face_prediction.evaluation.video import Colour, draw_dot, draw_line, h264_file
+from face_prediction.forecast import mouth_centre
 from face_prediction.live.sources import FindFace
 from face_prediction.live.streaming import LiveForecast, StreamingPredictor
+from face_prediction.tracking.geometry import LIPS, Crop
 from face_prediction.tracking.video import VideoFrame
+from robo_manip_baselines.runs.errors import RequestError
 
-RECENT = 30
-"""Frames that the rates on the screen are averaged over."""
+RECENT = 30  # frames that the rates on the screen are averaged over
 STAGES = ("detector", "predictor", "whole")
+TITLE = "face-prediction live"
+WHITE: Colour = (255, 255, 255)
+GREEN: Colour = (80, 230, 110)  # the mouth now, and the lips
+NEAR: Colour = (255, 225, 60)  # the mouth in the nearest frame that is forecast
+FAR: Colour = (255, 60, 40)  # and in the farthest
+INSET = 0.34
+"""Side of the magnified mouth as a share of the image's shorter side."""
+_ESCAPE = 27
+_FONT = 0  # OpenCV's FONT_HERSHEY_SIMPLEX; OpenCV is imported only when something is drawn
+
+Show = Callable[[NDArray[np.uint8], float], bool]
+"""Takes an image of a time in seconds; returns False once the user has seen enough."""
 
 
 @dataclass
@@ -40,9 +64,8 @@ class LiveStatistics:
         for stage, seconds in self.seconds.items():
             if seconds:
                 mean, high = 1e3 * np.mean(seconds), 1e3 * np.quantile(seconds, 0.95)
-                lines.append(
-                    f"| {stage} | {len(seconds)} | {mean:.1f} | {high:.1f} | {1e3 / mean:.1f} |"
-                )
+                times = f"{mean:.1f} | {high:.1f} | {1e3 / mean:.1f}"
+                lines.append(f"| {stage} | {len(seconds)} | {times} |")
         return "\n".join(lines)
 
 
@@ -58,17 +81,10 @@ def run_loop(
 ) -> None:
     """Find, forecast, draw and show, until there are no more frames or the user has seen enough.
 
-    Args:
-        frames: images with their times.
-        find: the detector.
-        predictor: in its first state.
-        show: takes the drawn images.
-        name: of the predictor, for the screen.
-        history: frames of a whole history.
-        statistics: is filled.
-        clock: seconds.
+    The predictor, whose ``name`` is on the screen, is in its first state; ``history`` is the number
+    of frames of a whole history; ``statistics`` are filled.
     """
-    last: float | None = None
+    last = None
     for frame in frames:
         begun = clock()
         landmarks = find(frame.image, frame.time)
@@ -110,3 +126,112 @@ def captions(
         count = len(forecast.landmarks)
         lines.append((f"{name}: mouth now (green) and in 1 to {count} frames", GREEN))
     return lines
+
+
+@contextmanager
+def video_sink(path: Path, rate: float) -> Iterator[Show]:
+    """An H.264 file, in which every image keeps its own time; ``rate`` images a second or so.
+
+    Raises:
+        RequestError: the folder cannot be written to, or there was no image.
+    """
+    with h264_file(path, rate, preset="veryfast", is_timed=True) as append:
+
+        def show(image: NDArray[np.uint8], time: float) -> bool:
+            append(image, time)
+            return True
+
+        yield show
+
+
+@contextmanager
+def window_sink() -> Iterator[Show]:
+    """A window on the screen; Escape, q or its close button end it.
+
+    Raises:
+        RequestError: this OpenCV has no windows, or there is no screen.
+    """
+    import cv2
+
+    gui = re.search(r"^\s*GUI:\s*(\S+)", cv2.getBuildInformation(), re.MULTILINE)
+    if gui and gui.group(1).upper() == "NONE":
+        raise RequestError(
+            "the OpenCV that is installed (opencv-python-headless) opens no window; name a file "
+            "with --out"
+        )
+    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not screen:
+        raise RequestError("there is no screen ($DISPLAY is not set); name a file with --out")
+
+    def show(image: NDArray[np.uint8], time: float) -> bool:
+        cv2.imshow(TITLE, np.ascontiguousarray(image[..., ::-1]))
+        is_ended = cv2.waitKey(1) & 0xFF in (_ESCAPE, ord("q"))
+        return not is_ended and cv2.getWindowProperty(TITLE, cv2.WND_PROP_VISIBLE) >= 1
+
+    cv2.namedWindow(TITLE, cv2.WINDOW_NORMAL)
+    try:
+        yield show
+    finally:
+        cv2.destroyAllWindows()
+
+
+def draw_mouth(
+    image: NDArray[np.uint8], landmarks: NDArray[np.floating], ahead: NDArray[np.floating]
+) -> None:
+    """Draw the lips and the mouth centre now, and the forecast centres, onto ``image``.
+
+    Landmarks (L, 2 or 3) are those now, and (H, L, 2) ``ahead``, in normalised image coordinates.
+    At the lower right the mouth is magnified, with the same drawn in: five frames are soon over,
+    and a mouth goes a few pixels in them.
+    """
+    import cv2
+
+    size = np.array([image.shape[1], image.shape[0]])
+    lips = landmarks[list(LIPS), :2] * size
+    path = np.vstack([mouth_centre(landmarks)[None], mouth_centre(ahead)]) * size
+    face = float(np.ptp(landmarks[:, 0]) * size[0])
+    window = max(round(0.6 * face), 8)
+    left, top = np.round(path[0] - window / 2).astype(int).tolist()
+    side = int(INSET * size.min())
+    inset = Crop(left, top, window).cut(image, side)
+    _draw_path(image, lips, path, max(1.5, 0.012 * face))
+    corner, scale = np.array([left, top]), side / window
+    _draw_path(inset, (lips - corner) * scale, (path - corner) * scale, max(2.0, 0.012 * side))
+    cv2.rectangle(inset, (0, 0), (side - 1, side - 1), WHITE, 1)
+    image[-side:, -side:] = inset
+
+
+def draw_text(image: NDArray[np.uint8], lines: Sequence[tuple[str, Colour]]) -> None:
+    """Write lines of text at the top left of ``image``, on a dark ground, sized to it."""
+    import cv2
+
+    if not lines:
+        return
+    scale = max(0.35, min(image.shape[:2]) / 800)
+    widest = max(cv2.getTextSize(text, _FONT, scale, 1)[0][0] for text, _ in lines)
+    room = image.shape[1] - round(30 * scale)
+    if widest > room > 0:
+        scale, widest = scale * (room / widest), room
+    step = round(30 * scale)
+    ground = image[: step * len(lines) + step // 2, : widest + step]
+    ground[:] = (ground * 0.45).astype(np.uint8)
+    for number, (text, colour) in enumerate(lines, start=1):
+        place = (step // 2, step * number)
+        cv2.putText(image, text, place, _FONT, scale, colour, 1, cv2.LINE_AA)
+
+
+def _draw_path(
+    image: NDArray[np.uint8], lips: NDArray[np.floating], path: NDArray[np.floating], radius: float
+) -> None:
+    """Dots for the lips (P, 2), the mouth now, and in every later frame (H + 1, 2), in pixels."""
+    # OpenCV counts from the middle of the first pixel
+    lips, path = lips - 0.5, path - 0.5
+    weights = np.linspace(0.0, 1.0, len(path) - 1)[:, None]
+    shades = np.round((1 - weights) * NEAR + weights * FAR).astype(int).tolist()
+    for point in lips:
+        draw_dot(image, point, radius / 2, GREEN)
+    draw_dot(image, path[0], radius + 1.5, (0, 0, 0))
+    for start, end, colour in zip(path[:-1], path[1:], shades, strict=True):
+        draw_line(image, start, end, colour, 1)
+    for point, colour in zip(path, [GREEN, *shades], strict=True):
+        draw_dot(image, point, radius, colour)

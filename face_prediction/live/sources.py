@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,22 +19,12 @@ from face_prediction.tracking.geometry import read_canonical_face
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 
-CAMERA_TIMEOUT = 5.0
-"""Seconds that a camera may take to give an image before it counts as gone."""
+if TYPE_CHECKING:
+    from cv2 import VideoCapture
+
+CAMERA_TIMEOUT = 5.0  # s that a camera may take to give an image before it counts as gone
 
 FindFace = Callable[[NDArray[np.uint8], float], NDArray[np.floating] | None]
-
-
-class Capture(Protocol):
-    """Interface of OpenCV's VideoCapture that is used here."""
-
-    def read(self) -> tuple[bool, Any]:
-        """The next image (rows, columns, 3) uint8 BGR."""
-        ...
-
-    def release(self) -> None:
-        """Let the camera go."""
-        ...
 
 
 def live_frames(
@@ -62,7 +52,7 @@ def _file_frames(path: Path) -> Generator[VideoFrame, None, None]:
         yield from video.frames()
 
 
-def open_camera(number: int) -> Capture:
+def open_camera(number: int) -> VideoCapture:
     """Camera ``number`` of the system, 0 being the first.
 
     Raises:
@@ -80,7 +70,7 @@ def open_camera(number: int) -> Capture:
 
 
 def camera_frames(
-    capture: Capture, clock: Callable[[], float] = time.monotonic
+    capture: VideoCapture, clock: Callable[[], float] = time.monotonic
 ) -> Generator[VideoFrame, None, None]:
     """The newest image of a camera each time one is asked for, until it gives no more.
 
@@ -106,8 +96,7 @@ def camera_frames(
 
     thread = threading.Thread(target=read, daemon=True)
     thread.start()
-    begun: float | None = None
-    last = -np.inf
+    begun, last = None, -np.inf
     try:
         while True:
             with arrived:

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.histories import dataset_image
 from face_prediction.dataset.sequences import SequenceSettings
-from face_prediction.prediction.interface import PictureNeeds, Predictor
+from face_prediction.prediction.interface import ImageNeeds, Predictor
 from face_prediction.tracking.extract import MAX_GAP, SAME_TIME
 from face_prediction.tracking.geometry import Crop, crop_around, image_points
 from face_prediction.tracking.tracks import NUM_LANDMARKS
@@ -43,12 +43,9 @@ def times_back(now: float, count: int, fps: float) -> NDArray[np.float64]:
 def landmarks_at(
     wanted: NDArray[np.float64], times: NDArray[np.float64], landmarks: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Landmarks (T, L, C) at ``wanted`` (T,), none later than the last of ``times``.
+    """Landmarks (T, L, C) at ``wanted`` (T,) s, of those (N, L, C) at increasing ``times`` (N,) s.
 
-    Args:
-        wanted: s; a time less than a millisecond from a frame's is that frame's.
-        times: (N,) s, increasing.
-        landmarks: (N, L, C).
+    None is wanted after the last; a time less than a millisecond from a frame's is that frame's.
     """
     after = np.clip(np.searchsorted(times, wanted - SAME_TIME), 0, len(times) - 1)
     before = np.maximum(after - 1, 0)
@@ -77,7 +74,7 @@ class LandmarkForecaster:
 
     predictor: Predictor
     horizon: int
-    needs = PictureNeeds(frames=0, size=0)
+    needs = ImageNeeds(frames=0, size=0)
 
     def forecast(self, landmarks: NDArray[np.float32]) -> NDArray[np.float32]:
         """Landmarks (H, L, 2) after those (T, L, 2)."""
@@ -85,15 +82,7 @@ class LandmarkForecaster:
 
 
 class NetworkForecaster:
-    """Features and forecasts of one network, in eval mode; each image is encoded once.
-
-    Args:
-        network: on its device.
-        name: in messages.
-
-    Attributes:
-        needs: images that it looks at.
-        span: K.
+    """Features and forecasts of one network on its device; each image is encoded once.
 
     Raises:
         RequestError: the network forecasts no landmarks.
@@ -122,24 +111,15 @@ class NetworkForecaster:
         features: list[torch.Tensor],
         last_image: NDArray[np.uint8],
     ) -> NDArray[np.float32]:
-        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features.
-
-        Raises:
-            RequestError: the network forecasts no landmarks.
-        """
+        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features."""
         import torch
 
         with torch.inference_mode():
-            ahead = self._network.decode(
-                self._tensor(landmarks[-self._network.history :]),
-                torch.cat(features, dim=1),
-                self._tensor(last_image),
-                make_images=False,
-            ).landmarks
+            seen = self._tensor(landmarks[-self._network.history :])
+            joined, last = torch.cat(features, dim=1), self._tensor(last_image)
+            ahead = self._network.decode(seen, joined, last, make_images=False).landmarks
         if ahead is None:
-            raise RequestError(
-                f"{self._name}: forecasts images and no landmarks; use another network"
-            )
+            raise RequestError(f"{self._name}: forecasts images and no landmarks; use another")
         return ahead[0].float().cpu().numpy()
 
     def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
@@ -158,8 +138,7 @@ class _Frame:
         landmarks: (L, 3) normalised image coordinates.
         box: (2, 2) least and largest x, y of them.
         image: None where nobody looks at it, or not any more.
-        cut: (S, S, 3) of it at the present crop, once it was needed.
-        features: of the network at the present crop, once they were needed.
+        cut: (S, S, 3) of it at the present crop, once needed, and ``features`` of the network.
     """
 
     time: float
@@ -198,23 +177,19 @@ class StreamingPredictor:
     A face that is gone for more than `MAX_GAP` seconds is forgotten, with its history. Between
     frames further apart than that nothing is known either.
 
-    Args:
-        forecaster: makes the forecasts.
-        settings: of the sequences that it was trained on: history, rate, margin, images.
+    Settings are of the sequences that the forecaster was trained on: history, rate, margin, images.
     """
 
     def __init__(
         self, forecaster: LandmarkForecaster | NetworkForecaster, settings: SequenceSettings
     ) -> None:
-        self._forecaster = forecaster
-        self._settings = settings
-        self._frames: deque[_Frame] = deque()
-        self._crop: Crop | None = None
+        self._forecaster, self._settings = forecaster, settings
+        self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
-        self._frames.clear()
-        self._crop = None
+        self._frames: deque[_Frame] = deque()
+        self._crop: Crop | None = None
 
     def update(
         self, time: float, landmarks: NDArray[np.floating] | None, image: NDArray[np.uint8]
@@ -229,11 +204,11 @@ class StreamingPredictor:
         Raises:
             ValueError: the time is not later.
         """
-        frames = self._frames
-        if frames and time <= frames[-1].time:
-            raise ValueError(f"a frame at {time} s after one at {frames[-1].time} s")
-        if frames and time - frames[-1].time > MAX_GAP + SAME_TIME:
+        if self._frames and time <= self._frames[-1].time:
+            raise ValueError(f"a frame at {time} s after one at {self._frames[-1].time} s")
+        if self._frames and time - self._frames[-1].time > MAX_GAP + SAME_TIME:
             self.reset()
+        frames = self._frames
         if landmarks is None:
             return None
         needs = self._forecaster.needs
@@ -256,12 +231,8 @@ class StreamingPredictor:
             for frame in frames:  # too old to be looked at again, whatever the crop will be
                 if frame.time < wanted[-needs.frames] - MAX_GAP - SAME_TIME:
                     frame.image = frame.cut = None
-        return LiveForecast(
-            landmarks=image_points(crop, ahead, size),
-            crop=crop,
-            is_new_crop=is_new,
-            known=int(np.sum(wanted >= times[0] - SAME_TIME)),
-        )
+        known = int(np.sum(wanted >= times[0] - SAME_TIME))
+        return LiveForecast(image_points(crop, ahead, size), crop, is_new, known)
 
     def _lay_crop(self, oldest: float, size: tuple[int, int]) -> tuple[Crop, bool]:
         """The old crop, or one around the faces since ``oldest``; whether it is new."""
@@ -304,5 +275,5 @@ class StreamingPredictor:
         if frame.cut is None:
             assert frame.image is not None
             size = self._forecaster.needs.size
-            frame.cut = dataset_picture(frame.image, crop, self._settings, size)
+            frame.cut = dataset_image(frame.image, crop, self._settings, size)
         return frame.cut

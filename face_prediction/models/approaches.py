@@ -17,7 +17,7 @@ from torch.nn import functional
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History, Losses, Output, PredictorModel
 from face_prediction.models.settings import ApproachSettings, CrossAttentionSettings, FusionSettings
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 LANDMARK_NUMBERS = 2 * NUM_LANDMARKS
@@ -117,8 +117,7 @@ class LandmarkDecoder(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return landmarks (B, H, L, 2) of tokens (B, H, D)."""
-        flat = self.out(functional.gelu(self.hidden(tokens)))
-        return flat.unflatten(-1, (NUM_LANDMARKS, 2))
+        return self.out(functional.gelu(self.hidden(tokens))).unflatten(-1, (NUM_LANDMARKS, 2))
 
 
 class CrossAttention(nn.Module):
@@ -159,24 +158,16 @@ class ApproachModel(PredictorModel):
 
     def __init__(self, settings: ApproachSettings) -> None:
         super().__init__()
-        self.history = settings.history
-        self.horizon = settings.horizon
-        self.needs = PictureNeeds(frames=settings.history, size=settings.size)
-        self.span = 1
-        self.makes_images = True
+        self.history, self.horizon, self.span = settings.history, settings.horizon, 1
+        self.needs = ImageNeeds(settings.history, settings.size)
         self.landmark_decoder, self.landmark_weight = None, 0.0
         self.image_encoder = ImageEncoder(settings.size, settings.channels, settings.width)
         self.future = nn.Parameter(0.02 * torch.randn(settings.horizon, settings.width))
         positions = sinusoids(settings.history + settings.horizon, settings.width)
         self.register_buffer("positions", positions, persistent=False)
+        sizes = (settings.width, settings.heads, settings.feedforward, settings.dropout)
         layer = nn.TransformerEncoderLayer(
-            settings.width,
-            settings.heads,
-            settings.feedforward,
-            settings.dropout,
-            activation="gelu",
-            batch_first=True,
-            norm_first=True,
+            *sizes, activation="gelu", batch_first=True, norm_first=True
         )
         self.transformer = nn.TransformerEncoder(
             layer, settings.layers, nn.LayerNorm(settings.width), enable_nested_tensor=False

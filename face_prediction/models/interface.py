@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from torch import Generator, Tensor, nn
 
 from face_prediction.forecast.interface import LandmarkSequences
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Future:
 
     Attributes:
         landmarks: (B, H, L, 2) float32.
-        images: (B, H, S, S, 3) uint8 RGB; without frames for a network that makes no images.
+        images: (B, H, S, S, 3) uint8 RGB.
     """
 
     landmarks: Tensor
@@ -63,12 +63,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Losses:
-    """Loss of a batch.
-
-    Attributes:
-        total: scalar to minimise.
-        terms: its parts before weighting, scalars without gradient.
-    """
+    """Loss of a batch: a scalar to minimise, and its parts before weighting, without gradient."""
 
     total: Tensor
     terms: dict[str, Tensor]
@@ -86,20 +81,15 @@ class PredictorModel(nn.Module, ABC):
         needs: images in the input.
         span: neighbouring images that the features of one frame come from: 1, or 2 where
             differences between frames count.
-        makes_images: whether `Future.images` must be there in training.
     """
 
     history: int
     horizon: int
-    needs: PictureNeeds
+    needs: ImageNeeds
     span: int
-    makes_images: bool
 
     def prepare(self, sequences: LandmarkSequences, generator: Generator) -> None:
-        """Set buffers from the training landmarks; called once, before training.
-
-        The sequences are whole (75 frames). The default does nothing.
-        """
+        """Set buffers from the training landmarks, whole sequences (75 frames), before training."""
 
     @abstractmethod
     def encode(self, landmarks: Tensor, images: Tensor) -> Tensor:

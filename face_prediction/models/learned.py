@@ -1,4 +1,7 @@
-"""Trained networks behind the `Predictor` interface: arrays in, a forecast out.
+"""Trained networks: checkpoints, and the `Predictor` that runs one: arrays in, a forecast out.
+
+A checkpoint is a folder with ``model.safetensors`` and ``config.json``. Each file is complete or
+absent, and damage is detected: both hold the SHA-256 of the tensors.
 
 Shapes: B histories, T frames of history, H horizon, L = 468 landmarks, S side of the images,
 P images at the end of the history.
@@ -6,6 +9,10 @@ P images at the end of the history.
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +21,28 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from face_prediction.models.checkpoint import CheckpointRecord, load_predictor_model
 from face_prediction.models.interface import History, Output, PredictorModel
+from face_prediction.models.settings import make_predictor_model, settings_class
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file, read_json, write_json
+
+try:
+    import safetensors
+    import safetensors.torch
+except ModuleNotFoundError:
+    raise RequestError(
+        "networks need safetensors; pip install 'robo_manip_baselines[face-prediction]'"
+    ) from None
+
+KIND = {"schema": "face_predictor", "version": 1}
+MODEL_FILE = "model.safetensors"
+CONFIG_FILE = "config.json"
 
 
 class LearnedPredictor:
-    """Runs a network on batches of histories; see `face_prediction.prediction.interface.Predictor`.
+    """`Predictor` that runs a network on batches of histories.
 
     Args:
         model: on its device; put into eval mode.
@@ -30,14 +50,10 @@ class LearnedPredictor:
         batch_size: histories that go through the network at once.
 
     Attributes:
-        model: the network.
-        record: its provenance.
         name: of the network, in the registry.
-        preset: name of its size.
         memory: frames of landmarks that it sees; a history must have as many or more.
         needs: images that it sees.
         horizon: most frames that it predicts.
-        train_subjects: people it was trained on, on whom it must not be evaluated.
     """
 
     def __init__(
@@ -46,11 +62,7 @@ class LearnedPredictor:
         self.model = model.eval()
         self.record = record
         self.name = record.model
-        self.preset = record.preset
-        self.memory = model.history
-        self.needs = model.needs
-        self.horizon = model.horizon
-        self.train_subjects = tuple(record.train_subjects)
+        self.memory, self.needs, self.horizon = model.history, model.needs, model.horizon
         self._batch_size = batch_size
 
     @classmethod
@@ -62,7 +74,15 @@ class LearnedPredictor:
         Raises:
             RequestError: it is absent, damaged or of another schema.
         """
-        return cls(*load_predictor_model(Path(folder), device), batch_size)
+        folder = Path(folder)
+        record, tensors = read_predictor_checkpoint(folder)
+        try:
+            settings = settings_class(record.model).from_json(record.settings)
+        except RequestError as error:
+            raise RequestError(f"{folder / CONFIG_FILE}: {error}") from None
+        model = make_predictor_model(record.model, settings)
+        load_tensors(model, tensors, folder / MODEL_FILE)
+        return cls(model.to(device), record, batch_size)
 
     @property
     def test_fold(self) -> int:
@@ -79,7 +99,7 @@ class LearnedPredictor:
         return self.record.folds["test"][0]
 
     def predict(
-        self, landmarks: NDArray[np.floating], pictures: NDArray[np.uint8] | None, horizon: int
+        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
         """Predict the next ``horizon`` frames; see `Predictor.predict`.
 
@@ -92,30 +112,24 @@ class LearnedPredictor:
         if not 1 <= horizon <= self.horizon:
             raise RequestError(f"horizon {horizon}: {self.name} forecasts 1 to {self.horizon}")
         landmarks = self._checked_landmarks(np.asarray(landmarks))
-        images = self._checked_images(pictures, len(landmarks))
+        images = self._checked_images(images, len(landmarks))
         device = next(self.model.parameters()).device
         batches: list[dict[str, NDArray[Any]]] = []
         freedom = None
         for first in range(0, len(landmarks), self._batch_size):
             rows = slice(first, first + self._batch_size)
-            history = History(
-                torch.tensor(landmarks[rows], dtype=torch.float32, device=device),
-                torch.tensor(images[rows], device=device),
-            )
+            seen = torch.tensor(landmarks[rows], dtype=torch.float32, device=device)
             with torch.inference_mode():
-                output = self.model(history)
+                output = self.model(History(seen, torch.tensor(images[rows], device=device)))
             batches.append(_arrays(output, horizon))
             freedom = output.degrees_of_freedom
         joined = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
-        unknown = np.full((len(landmarks), horizon, NUM_LANDMARKS, 2), np.nan, dtype=np.float32)
-        return Forecast(
-            landmarks=joined.get("landmarks", unknown),
-            pictures=joined.get("images"),
-            mouth_scale=joined.get("mouth_scale"),
-            degrees_of_freedom=None
-            if freedom is None
-            else freedom[:horizon].double().cpu().numpy(),
-        )
+        if "landmarks" not in joined:
+            shape = (len(landmarks), horizon, NUM_LANDMARKS, 2)
+            joined["landmarks"] = np.full(shape, np.nan, dtype=np.float32)
+        if freedom is not None:
+            joined["degrees_of_freedom"] = freedom[:horizon].double().cpu().numpy()
+        return Forecast(**joined)
 
     def _checked_landmarks(self, landmarks: NDArray[np.floating]) -> NDArray[np.floating]:
         shape = landmarks.shape
@@ -131,24 +145,173 @@ class LearnedPredictor:
         return landmarks
 
     def _checked_images(self, images: NDArray[np.uint8] | None, rows: int) -> NDArray[np.uint8]:
-        needs = self.needs
-        wanted = (rows, needs.frames, needs.size, needs.size, 3)
-        if images is None and not needs.frames:
+        wanted = (rows, self.needs.frames, self.needs.size, self.needs.size, 3)
+        if images is None and not self.needs.frames:
             return np.empty(wanted, dtype=np.uint8)
         if images is None or images.shape != wanted or images.dtype != np.uint8:
             found = "none" if images is None else f"{images.dtype} of shape {images.shape}"
-            raise RequestError(f"pictures: {found}; {self.name} needs uint8 of shape {wanted}")
+            raise RequestError(f"images: {found}; {self.name} needs uint8 of shape {wanted}")
         return images
 
 
 def _arrays(output: Output, horizon: int) -> dict[str, NDArray[Any]]:
     """Return the outputs that there are, by name, for the first ``horizon`` frames."""
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays = {}
     for name in ("landmarks", "mouth_scale"):
-        values: Tensor | None = getattr(output, name)
-        if values is not None:
+        if (values := getattr(output, name)) is not None:
             arrays[name] = values[:, :horizon].float().cpu().numpy()
     if output.images is not None:
         images = (255 * output.images[:, :horizon].float()).round().clamp(0, 255).to(torch.uint8)
         arrays["images"] = images.permute(0, 1, 3, 4, 2).contiguous().cpu().numpy()
     return arrays
+
+
+@dataclass(frozen=True)
+class CheckpointRecord:
+    """Provenance of a trained network.
+
+    Attributes:
+        model: name in the registry.
+        settings: JSON of its settings, which started from ``preset``.
+        training: JSON of the `PredictorTrainSettings`.
+        dataset: JSON of the dataset's `SequenceSettings`.
+        dataset_sha256: of its ``dataset.json``.
+        folds: folds by use: ``train``, ``validation``, ``test``.
+        train_subjects: people trained on, on whom the network must not be evaluated.
+        step: optimizer steps that made these weights.
+        validation: losses and errors (crops) on the held-out fold, if there is one.
+        versions: of the software, by package.
+    """
+
+    model: str
+    settings: dict[str, Any]
+    preset: str
+    training: dict[str, Any]
+    seed: int
+    dataset: dict[str, Any]
+    dataset_sha256: str
+    folds: dict[str, list[int]]
+    train_subjects: list[str]
+    step: int
+    validation: dict[str, float]
+    versions: dict[str, str]
+
+
+def save_predictor_checkpoint(
+    folder: Path, record: CheckpointRecord, state: Mapping[str, Tensor]
+) -> None:
+    """Write both files of a checkpoint.
+
+    Raises:
+        RequestError: the folder cannot be written to.
+    """
+    digest = write_tensors(folder / MODEL_FILE, state, KIND)
+    write_json(folder / CONFIG_FILE, {**KIND, **asdict(record), "model_sha256": digest})
+
+
+def read_predictor_checkpoint(folder: Path) -> tuple[CheckpointRecord, dict[str, Tensor]]:
+    """Read and check both files of a checkpoint.
+
+    Raises:
+        RequestError: a file is absent, damaged or of another schema, or they do not belong
+            together.
+    """
+    path = folder / CONFIG_FILE
+    _require_file(path)
+    data = read_json(path)
+    require_kind(path, data, KIND)
+    try:
+        record = CheckpointRecord(**{x.name: data[x.name] for x in fields(CheckpointRecord)})
+        expected = data["model_sha256"]
+    except KeyError as error:
+        raise RequestError(f"{path}: key {error} is missing; train the network again") from None
+    tensors, _, digest = read_tensors(folder / MODEL_FILE)
+    if digest != expected:
+        raise RequestError(
+            f"{folder}: {MODEL_FILE} and {CONFIG_FILE} are of different steps; "
+            "give the training command again, which puts that right"
+        )
+    return record, tensors
+
+
+def load_tensors(model: PredictorModel, tensors: Mapping[str, Tensor], source: Path) -> None:
+    """Load the tensors that were read from ``source`` into a network.
+
+    Raises:
+        RequestError: they do not fit; the first that differs is named.
+    """
+    wanted = model.state_dict()
+    for name in sorted({*wanted, *tensors}):
+        if name not in tensors:
+            raise RequestError(f"{source}: tensor '{name}' is missing")
+        if name not in wanted:
+            raise RequestError(f"{source}: tensor '{name}' is none of this network")
+        found, expected = (f"{x.dtype} {tuple(x.shape)}" for x in (tensors[name], wanted[name]))
+        if found != expected:
+            raise RequestError(f"{source}: tensor '{name}' is {found}, expected {expected}")
+    model.load_state_dict(tensors)
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> str:
+    """Write a safetensors file with a JSON record in it, and return `tensor_hash`.
+
+    Raises:
+        RequestError: the folder cannot be written to.
+    """
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    digest = tensor_hash(plain)
+    # one entry: safetensors writes several in any order, and equal networks shall be equal files
+    metadata = {"record": json.dumps({**record, "sha256": digest})}
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(safetensors.torch.save(plain, metadata))
+    return digest
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
+    """Read tensors, record and hash, as `write_tensors` wrote them.
+
+    Raises:
+        RequestError: the file is absent, damaged or of another kind.
+    """
+    _require_file(path)
+    try:
+        with safetensors.safe_open(path, framework="pt", device="cpu") as file:
+            # cloned: tensors must not change when the file is replaced
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+            record = json.loads(file.metadata()["record"])
+        digest = record.pop("sha256")
+    except (OSError, LookupError, TypeError, ValueError, safetensors.SafetensorError) as error:
+        raise RequestError(
+            f"{path}: damaged, or not written by this program ({type(error).__name__}: {error})"
+        ) from None
+    if tensor_hash(tensors) != digest:
+        raise RequestError(f"{path}: damaged (its tensors are not those that were written)")
+    return tensors, record, digest
+
+
+def require_kind(path: Path, record: Mapping[str, Any], kind: Mapping[str, Any]) -> None:
+    """Check the schema and version in a file's record.
+
+    Raises:
+        RequestError: it is of another schema or version.
+    """
+    if any(record.get(key) != value for key, value in kind.items()):
+        raise RequestError(
+            f"{path}: schema '{record.get('schema')}' version {record.get('version')}, expected "
+            f"'{kind['schema']}' {kind['version']}"
+        )
+
+
+def tensor_hash(tensors: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of names, types, shapes and numbers, in the order of the names."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        plain = tensor.detach().cpu().contiguous().reshape(-1)
+        digest.update(plain.view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        raise RequestError(f"{path}: no such file; name a folder written by face-prediction train")

@@ -34,12 +34,14 @@ def _within(default: Any, low: float, high: float) -> Any:
 class _CheckedSettings:
     """Settings whose fields declare what is valid.
 
+    Attributes:
+        given: format of a name and a value in error messages.
+
     Raises:
         RequestError: a value is not valid.
     """
 
     given: ClassVar[str]
-    """Format of a name and a value in error messages."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -58,24 +60,7 @@ class PredictorTrainSettings(_CheckedSettings):
     """Everything that the weights depend on, beside network, data and seed.
 
     The defaults are the preset ``paper``: Adam at 1e-4 (paper, IV.B); how long, and on how many
-    sequences at once, the paper does not say.
-
-    Attributes:
-        steps: optimizer steps in all.
-        batch_size: sequences of a step.
-        learning_rate: of Adam.
-        schedule: ``constant``, or ``cosine``: down to a hundredth of the rate at the last step.
-        warmup_steps: steps over which the learning rate rises from 0.
-        clip_norm: largest norm of the gradient; 0 for no clipping.
-        ema_decay: decay of the moving average of the weights, which is then what is validated and
-            kept; 0 for none.
-        augment: mirror half of the sequences, and move and relight all.
-        precision: ``auto`` is bf16 on a GPU, fp32 elsewhere.
-        validate_every: steps between validations on the held-out fold.
-        validation_sequences: sequences of that fold used for it, evenly spread; 0 for all.
-
-    Raises:
-        RequestError: a value is not valid; the message names the option.
+    sequences at once, the paper does not say. Fields are the options of `FaceTrainOptions`.
     """
 
     given: ClassVar[str] = "--{} {}"
@@ -106,12 +91,11 @@ class ModelSettings(_CheckedSettings):
     """Base of every network's settings. The defaults are the preset ``paper``.
 
     Every field of a subclass has a default: a number, a bool, a text or a tuple of integers.
-    Values that are read back must be of the same type.
+    Values that are read back must be of the same type. ``cpu`` holds what differs in that preset.
     """
 
     given: ClassVar[str] = "setting {}={}"
     cpu: ClassVar[Mapping[str, Any]] = {}
-    """Values of the preset ``cpu`` that differ."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, as `from_json` takes them."""
@@ -175,16 +159,11 @@ class ApproachSettings(ModelSettings):
         size: side of the images in pixels, seen and predicted.
         channels: of the convolutions, each of which halves the image; the decoder has the same in
             reverse.
-        width: of the tokens of the Transformer encoder.
-        heads: of the Transformer encoder.
-        layers: of the Transformer encoder.
+        width: of the tokens of the Transformer encoder, with ``heads`` and ``layers``.
         feedforward: hidden width of its feed-forward networks.
         dropout: in the Transformer encoder.
         history: frames seen.
         horizon: frames predicted.
-
-    Raises:
-        RequestError: a value is not valid.
     """
 
     cpu: ClassVar[Mapping[str, Any]] = {
@@ -192,9 +171,7 @@ class ApproachSettings(ModelSettings):
         "channels": (8, 16, 32, 64),
         "width": 128,
         "heads": 4,
-        "feedforward": 256,
-        "dropout": 0.0,
-    }
+    } | {"feedforward": 256, "dropout": 0.0}
 
     size: int = field(default=256, metadata={"choices": IMAGE_SIZES})
     channels: tuple[int, ...] = (32, 64, 128, 256, 256, 256)
@@ -209,10 +186,8 @@ class ApproachSettings(ModelSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.width % (2 * self.heads):
-            raise RequestError(
-                f"setting width={self.width}: not divisible; valid: a multiple of 2 x "
-                f"heads={self.heads}"
-            )
+            valid = f"valid: a multiple of 2 x heads={self.heads}"
+            raise RequestError(f"setting width={self.width}: not divisible; {valid}")
         self._require_halvings(self.size, self.channels, least=2)
 
 
@@ -233,18 +208,12 @@ class FusionSettings(ApproachSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.landmark_width % 2:
-            raise RequestError(
-                f"setting landmark_width={self.landmark_width}: odd; valid: an even number"
-            )
+            raise RequestError(f"setting landmark_width={self.landmark_width}: odd; valid: even")
 
 
 @dataclass(frozen=True)
 class CrossAttentionSettings(FusionSettings):
-    """Settings of cross-attention fusion.
-
-    Attributes:
-        attention_width: of queries, keys and values (d of equation 1).
-    """
+    """Settings of cross-attention; ``attention_width``: of queries, keys, values (d of eq. 1)."""
 
     cpu: ClassVar[Mapping[str, Any]] = {**FusionSettings.cpu, "attention_width": 128}
 
@@ -271,9 +240,6 @@ class ResidualSettings(ModelSettings):
         mouth_weight: of the mouth's absolute error, where the likelihood of it counts 1.
         landmark_weight: of the absolute error of all landmarks.
         picture_weight: of the absolute error of the images.
-
-    Raises:
-        RequestError: a value is not valid.
     """
 
     cpu: ClassVar[Mapping[str, Any]] = {
@@ -301,12 +267,10 @@ class ResidualSettings(ModelSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("recent", "pictures"):
-            if getattr(self, name) > self.history:
-                raise RequestError(
-                    f"setting {name}={getattr(self, name)}: too many; valid: at most "
-                    f"history={self.history}"
-                )
+        for name, value in (("recent", self.recent), ("pictures", self.pictures)):
+            if value > self.history:
+                valid = f"valid: at most history={self.history}"
+                raise RequestError(f"setting {name}={value}: too many; {valid}")
         self._require_halvings(self.region, self.channels, least=1)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from face_prediction.motion.motion import (
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES, continuous_quaternions
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_file
 from robo_manip_baselines.runs.npz import read_npz, require_array, require_json, write_npz
 
 SCHEMA = "recorded_face_motion"
@@ -101,11 +102,14 @@ def read_attributions(path: Path) -> dict[str, Attribution]:
     Raises:
         RequestError: the file cannot be read, has no such table, or a row is incomplete.
     """
+
+    def wrong(problem: str) -> RequestError:
+        return RequestError(f"--attribution {path}: {problem}")
+
     try:
-        text = path.read_text(encoding="utf-8")
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise RequestError(f"--attribution {path}: cannot be read ({error})") from None
-    lines = text.splitlines()
+        raise wrong(f"cannot be read ({error})") from None
     rows = csv.reader(lines) if path.suffix == ".csv" else _markdown_rows(lines)
     header: list[str] | None = None
     is_found = False
@@ -118,31 +122,21 @@ def read_attributions(path: Path) -> dict[str, Attribution]:
         elif header is None or not cells:
             continue
         elif len(cells) != len(header):
-            raise RequestError(
-                f"--attribution {path}: {len(cells)} cells for {len(header)} columns in the row "
-                f"of '{cells[0]}'"
-            )
+            raise wrong(f"{len(cells)} cells for {len(header)} columns in the row of '{cells[0]}'")
         else:
             row = dict(zip(header, cells, strict=True))
             if missing := [name for name in COLUMNS if not row[name]]:
-                raise RequestError(
-                    f"--attribution {path}: row '{row['clip']}' has no {', '.join(missing)}"
-                )
-            if row["ship"].lower() not in ("yes", "no"):
-                raise RequestError(
-                    f"--attribution {path}: ship '{row['ship']}' in the row of '{row['clip']}'; "
-                    "yes or no"
-                )
+                raise wrong(f"row '{row['clip']}' has no {', '.join(missing)}")
+            ship = row["ship"].lower()
+            if ship not in ("yes", "no"):
+                raise wrong(f"ship '{row['ship']}' in the row of '{row['clip']}'; yes or no")
             clip = Path(row["clip"]).stem
             if clip in attributions:
-                raise RequestError(f"--attribution {path}: two rows for '{clip}'")
+                raise wrong(f"two rows for '{clip}'")
             kept = {name: row.get(name, "") for name in (*COLUMNS[3:], "kind", "what")}
-            ship = row["ship"].lower() == "yes"
-            attributions[clip] = Attribution(clip, row["subject"], ship, **kept)
+            attributions[clip] = Attribution(clip, row["subject"], ship == "yes", **kept)
     if not is_found:
-        raise RequestError(
-            f"--attribution {path}: no table with the columns {', '.join(COLUMNS)} in it"
-        )
+        raise wrong(f"no table with the columns {', '.join(COLUMNS)} in it")
     return attributions
 
 
@@ -183,34 +177,26 @@ def track_files(given: Iterable[Path]) -> list[Path]:
     return found
 
 
-def attribution_of(
-    path: Path, rows: Mapping[str, Attribution] | None, table: Path | None
-) -> Attribution:
-    """The row of the clip of a track file; without a table, the clip is its own subject.
+def attributed_tracks(tracks: Iterable[Path], table: Path | None) -> list[tuple[Path, Attribution]]:
+    """The track files named, or in the folders named, with the row of each.
+
+    Without a table every clip may ship, and is its own subject.
 
     Raises:
-        RequestError: the table has no row for the clip.
+        RequestError: as `read_attributions` and `track_files`; or a clip has no row.
     """
-    if rows is None:
-        return Attribution(path.stem, path.stem, True)
-    if path.stem not in rows:
-        raise RequestError(f"{path}: no row for '{path.stem}' in {table}; add one (ship yes or no)")
-    return rows[path.stem]
+    if table is None:
+        return [(path, Attribution(path.stem, path.stem, True)) for path in track_files(tracks)]
+    rows, paths = read_attributions(table), track_files(tracks)
+    for path in paths:
+        if (clip := path.stem) not in rows:
+            raise RequestError(f"{path}: no row for '{clip}' in {table}; add one (ship yes or no)")
+    return [(path, rows[path.stem]) for path in paths]
 
 
 def refuse_other_files(out: Path) -> None:
-    """Check that ``out`` can be written and that nothing else is lost by it.
-
-    Raises:
-        RequestError: it is a folder, or a file of another kind.
-    """
-    if out.is_dir():
-        raise RequestError(f"--out {out}: is a folder; name a file")
-    if out.exists():
-        try:
-            read_npz(out, SCHEMA, VERSION)
-        except RequestError as error:
-            raise RequestError(f"{error}; it is in the way of --out, so remove it first") from None
+    """Raise RequestError if ``out`` is a folder, or a file of another kind."""
+    require_out_file(out, lambda path: read_npz(path, SCHEMA, VERSION))
 
 
 @dataclass(frozen=True)
@@ -238,30 +224,19 @@ def lift_clips(
     settings: MotionSettings,
     only: Collection[str] | None = None,
 ) -> tuple[list[LiftedClip], int]:
-    """Lift the clips that may ship, and count those that may not.
-
-    Args:
-        tracks: files, or folders of files.
-        table: attributions; None: all may ship.
-        settings: of the motion.
-        only: names of clips to lift; None: all that may ship.
+    """Lift the clips that may ship (of the names ``only``, if given), and count those that may not.
 
     Raises:
         RequestError: a track has no row or cannot be used.
     """
-    rows = None if table is None else read_attributions(table)
+    rows = attributed_tracks(tracks, table)
     clips: list[LiftedClip] = []
-    withheld = 0
-    for path in track_files(tracks):
-        row = attribution_of(path, rows, table)
-        if not row.ship:
-            withheld += 1
-        elif only is None or row.clip in only:
+    for path, row in rows:
+        if row.ship and (only is None or row.clip in only):
             track = load_track(path)
-            motion = lift(track, settings)
             video = str(track.source.get("sha256", ""))
-            clips.append(LiftedClip(path, row, motion, dict(track.detector), video))
-    return clips, withheld
+            clips.append(LiftedClip(path, row, lift(track, settings), dict(track.detector), video))
+    return clips, sum(not row.ship for _, row in rows)
 
 
 @dataclass(frozen=True)
@@ -309,10 +284,8 @@ class RecordedMotion:
         """One line: seconds, runs, subjects and the shortest run."""
         subjects = len(set(self.run_subject.tolist()))
         shortest = float(np.min(self.run_length - 1)) / self.fps
-        return (
-            f"{self.seconds:.1f} s in {len(self.run_start)} runs of {subjects} subjects, "
-            f"the shortest {shortest:.1f} s"
-        )
+        runs = f"{len(self.run_start)} runs of {subjects} subjects"
+        return f"{self.seconds:.1f} s in {runs}, the shortest {shortest:.1f} s"
 
     def settings(self) -> MotionSettings:
         """Settings that the library was made with.
@@ -321,14 +294,11 @@ class RecordedMotion:
             RequestError: its metadata hold none.
         """
         try:
-            stored = dict(self.metadata["settings"])
-            limits = QualityLimits(**stored.pop("limits"))
-            return MotionSettings(limits=limits, **stored)
+            stored = self.metadata["settings"]
+            return MotionSettings(**{**stored, "limits": QualityLimits(**stored["limits"])})
         except (KeyError, TypeError, ValueError) as error:
-            raise RequestError(
-                f"--library: its metadata hold no settings of export-motion ({error}); "
-                "make it again"
-            ) from None
+            wrong = f"its metadata hold no settings of export-motion ({error}); make it again"
+            raise RequestError(f"--library: {wrong}") from None
 
 
 def record_motion(
@@ -339,16 +309,13 @@ def record_motion(
     Raises:
         RequestError: no clip has a run, or the clips differ in rate.
     """
-    detectors: list[dict[str, Any]] = []
-    for clip in clips:
-        if clip.detector not in detectors:
-            detectors.append(clip.detector)
+    detectors = [clip.detector for clip in clips]
     metadata = {
         "camera_model": CAMERA_MODEL,
         "head_pose": HEAD_POSE,
         "mouth": MOUTH_MODEL,
         "settings": asdict(settings),
-        "detectors": detectors,
+        "detectors": [d for i, d in enumerate(detectors) if d not in detectors[:i]],
         "attribution": {clip.row.clip: clip.row.record() for clip in clips if clip.motion.runs},
         "clips": {c.row.clip: motion_statistics(c.motion, c.row.subject) for c in clips},
         "withheld_clips": withheld,
@@ -370,9 +337,8 @@ def motion_statistics(motion: ClipMotion, subject: str) -> dict[str, Any]:
         speed = np.linalg.norm(steps, axis=1) * motion.fps * 100
         row["speed_median_cm_s"] = round(float(np.median(speed)), 1)
         row["speed_p95_cm_s"] = round(float(np.percentile(speed, 95)), 1)
-        row["tremor_mm"] = [
-            round(1000 * max(step_tremor(part[:, axis]) for part in kept), 2) for axis in range(3)
-        ]
+        tremors = [max(step_tremor(part[:, axis]) for part in kept) for axis in range(3)]
+        row["tremor_mm"] = [round(1000 * tremor, 2) for tremor in tremors]
     return row
 
 
@@ -384,18 +350,12 @@ def join_runs(
     Raises:
         RequestError: no clip has a run, or the clips differ in rate.
     """
-    parts = [
-        (clip, subject, motion, slice(start, stop))
-        for clip, subject, motion in clips
-        for start, stop in motion.runs
-    ]
+    parts = [(*clip, slice(*run)) for clip in clips for run in clip[2].runs]
     if not parts:
         raise RequestError("no run is long enough and within reach; nothing to write")
     rates = {motion.fps for _, _, motion in clips}
     if len(rates) > 1:
-        raise RequestError(
-            f"tracks of different rates {sorted(rates)}; extract them all with one --fps"
-        )
+        raise RequestError(f"tracks of different rates {sorted(rates)}; extract all with one --fps")
     fps = rates.pop()
     lengths = np.array([part.stop - part.start for *_, part in parts], dtype=np.int64)
     orientations = [continuous_quaternions(m.orientation[part]) for _, _, m, part in parts]
@@ -448,13 +408,8 @@ def load_motion(path: Path) -> RecordedMotion:
     values["fps"] = float(values["fps"])
     motion = RecordedMotion(**values, metadata=require_json(path, arrays, "metadata"))
     joined = np.concatenate([[0], motion.run_start + motion.run_length])
-    if (
-        len(motion.run_start) == 0
-        or motion.fps <= 0
-        or np.any(motion.run_length < 2)
-        or not np.array_equal(joined[:-1], motion.run_start)
-        or joined[-1] != len(motion.time)
-    ):
+    is_whole = np.array_equal(joined, [*motion.run_start, len(motion.time)])
+    if len(joined) == 1 or motion.fps <= 0 or np.any(motion.run_length < 2) or not is_whole:
         raise RequestError(f"{path}: 'run_start' and 'run_length' do not divide the frames")
     norms = np.linalg.norm(motion.orientation.astype(float), axis=1)
     if np.any(np.abs(norms - 1) > 1e-5):  # float32 quaternions are unit to 1e-7

@@ -267,10 +267,8 @@ def lift(track: FaceTrack, settings: MotionSettings) -> ClipMotion:
         RequestError: the track's frames are not at a constant rate.
     """
     if not track.has_constant_rate:
-        raise RequestError(
-            f"{track.source.get('name', 'track')}: its frames are not at a constant rate; "
-            "extract it with --fps 30"
-        )
+        wrong = "its frames are not at a constant rate; extract it with --fps 30"
+        raise RequestError(f"{track.source.get('name', 'track')}: {wrong}")
     mouth, orientation, jaw = lift_landmarks(track.landmarks, track.valid, track.image_size)
     quality = assess(mouth, orientation, jaw, track.fps, settings.limits)
     raw_depth = mouth[:, 2].copy()

@@ -45,14 +45,14 @@ def tables(library: RecordedMotion) -> str:
     pooled = [row for row in clips.values() if row["frames"] <= long_enough]
     subjects = {row["subject"] for row in used.values()}
     keys = ("frames", "kept", "no_face", "spike", "turned_away", "too_short", "out_of_reach")
-    cuts = [
-        (name, *(row[key] for key in (*keys, "jumps")))
-        for name, row in clips.items()
-        if row["frames"] > long_enough
-    ]
+    keys += ("jumps",)
+    whole = {name: row for name, row in clips.items() if row["frames"] > long_enough}
+    cuts = [(name, *(row[key] for key in keys)) for name, row in whole.items()]
     if pooled:
-        sums = (sum(row[key] for row in pooled) for key in (*keys, "jumps"))
+        sums = (sum(row[key] for row in pooled) for key in keys)
         cuts.append((f"{len(pooled)} clips shorter than a run", *sums))
+    attribution = library.metadata["attribution"].items()
+    sources = [(name, row["licence"], row["source"]) for name, row in attribution]
     lines = [
         f"{library.seconds:.1f} s of continuous motion in {len(library.run_start)} runs, "
         f"of {len(subjects)} people, at {library.fps:g} frames a second. {extremes(library)}",
@@ -85,13 +85,7 @@ def tables(library: RecordedMotion) -> str:
             cuts,
         ),
         "",
-        *markdown_table(
-            ("clip", "licence", "source"),
-            [
-                (name, row["licence"], row["source"])
-                for name, row in library.metadata["attribution"].items()
-            ],
-        ),
+        *markdown_table(("clip", "licence", "source"), sources),
     ]
     return "\n".join(lines)
 
@@ -260,18 +254,11 @@ def _shade_cuts(axes: Any, seconds: np.ndarray, motion: ClipMotion) -> None:
     classes["no_face"] |= classes["spike"]
     step = 1 / motion.fps
     for key, (label, colour) in CUT_COLOURS.items():
-        edges = np.flatnonzero(
-            np.diff(np.concatenate([[False], classes[key], [False]]).astype(int))
-        )
-        for number, (start, stop) in enumerate(edges.reshape(-1, 2)):
-            axes.axvspan(
-                seconds[start] - step / 2,
-                seconds[stop - 1] + step / 2,
-                color=colour,
-                alpha=0.45,
-                lw=0,
-                label=label if number == 0 else None,
-            )
+        padded = np.concatenate([[False], classes[key], [False]]).astype(int)
+        for start, stop in np.flatnonzero(np.diff(padded)).reshape(-1, 2):
+            left, right = seconds[start] - step / 2, seconds[stop - 1] + step / 2
+            axes.axvspan(left, right, color=colour, alpha=0.45, lw=0, label=label)
+            label = None  # one entry of the legend for each class
 
 
 def _draw_speeds(axes: Any, motion: ClipMotion) -> None:

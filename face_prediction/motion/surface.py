@@ -21,6 +21,7 @@ from face_prediction.tracking.geometry import (
     image_rays,
     view_size,
 )
+from face_prediction.tracking.tracks import Size
 from robo_manip_baselines.runs.errors import RequestError
 
 CANONICAL_MEAN = np.array([0.0, -0.00676, 0.04159])
@@ -83,18 +84,13 @@ class JawFit:
     measured: np.ndarray
 
 
-def metric_landmarks(
-    landmarks: np.ndarray, head_pose: np.ndarray, image_size: tuple[int, int]
-) -> np.ndarray:
+def metric_landmarks(landmarks: np.ndarray, head_pose: np.ndarray, image_size: Size) -> np.ndarray:
     """Lift landmarks (T, V, 3) to metres in the head frame.
 
     MediaPipe's z is a depth on the scale of x, relative to the face's mean distance; the head
     pose says what that distance is (``face_geometry/libs/geometry_pipeline.cc``, undone).
-
-    Args:
-        landmarks: normalised image coordinates and relative depth / image width.
-        head_pose: (T, 4, 4) metres, camera from head.
-        image_size: (width, height) in pixels.
+    ``landmarks`` are normalised image coordinates and relative depth / image width, ``head_pose``
+    (T, 4, 4) metres, camera from head.
     """
     points = np.asarray(landmarks, dtype=float)
     rays = image_rays(points, image_size)
@@ -112,9 +108,8 @@ def align(faces: np.ndarray, reference: np.ndarray, still: np.ndarray) -> np.nda
     """
     middle = faces[:, still].mean(axis=1, keepdims=True)
     goal = reference[still].mean(axis=0)
-    u, _, vt = np.linalg.svd(
-        np.swapaxes(faces[:, still] - middle, 1, 2) @ (reference[still] - goal)
-    )
+    centred = np.swapaxes(faces[:, still] - middle, 1, 2)
+    u, _, vt = np.linalg.svd(centred @ (reference[still] - goal))
     flip = np.broadcast_to(np.eye(3), u.shape).copy()
     flip[:, 2, 2] = np.linalg.det(u @ vt)
     return (faces - middle) @ (u @ flip @ vt) + goal
@@ -262,9 +257,8 @@ def mediapipe_topology() -> Topology:
     }
     # the list of edges goes round one triangle after the other
     triangles = pairs(Mesh.FACE_LANDMARKS_TESSELATION).reshape(-1, 3, 2)[:, :, 0]
-    return Topology(
-        triangles.astype(np.int32), {name: np.array(group) for name, group in groups.items()}
-    )
+    arrays = {name: np.array(group) for name, group in groups.items()}
+    return Topology(triangles.astype(np.int32), arrays)
 
 
 def ordered_loops(edges: np.ndarray) -> list[list[int]]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class PictureNeeds:
+class ImageNeeds:
     """Images of the history that a predictor needs.
 
     Attributes:
@@ -33,14 +33,14 @@ class Forecast:
 
     Attributes:
         landmarks: (B, H, L, 2) float32; NaN where there is no forecast.
-        pictures: (B, H, S, S, 3) uint8 RGB; None: the predictor makes no images.
+        images: (B, H, S, S, 3) uint8 RGB; None: the predictor makes no images.
         mouth_scale: (B, H, 2) scale of the error of the mouth centre along U and V; None: the
             predictor gives no intervals.
         degrees_of_freedom: (H, 2) degrees of freedom of that Student-t error; infinite: a Gaussian.
     """
 
     landmarks: NDArray[np.float32]
-    pictures: NDArray[np.uint8] | None = None
+    images: NDArray[np.uint8] | None = None
     mouth_scale: NDArray[np.float32] | None = None
     degrees_of_freedom: NDArray[np.float64] | None = None
 
@@ -59,21 +59,18 @@ class Predictor(Protocol):
         ...
 
     @property
-    def needs(self) -> PictureNeeds:
+    def needs(self) -> ImageNeeds:
         """Images of the history that it needs."""
         ...
 
     def predict(
-        self,
-        landmarks: NDArray[np.floating],
-        pictures: NDArray[np.uint8] | None,
-        horizon: int,
+        self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
         """Forecast ``horizon`` frames.
 
         Args:
             landmarks: (B, T, L, 2), the newest last, 30 a second.
-            pictures: (B, P, S, S, 3) uint8 RGB of the last P frames, see `needs`; None where it
+            images: (B, P, S, S, 3) uint8 RGB of the last P frames, see `needs`; None where it
                 needs none.
             horizon: 1 or more; a trained network has a longest one.
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from face_prediction.tracking.geometry import CENTIMETRE
-from face_prediction.tracking.tracks import NUM_LANDMARKS
+from face_prediction.tracking.tracks import NUM_LANDMARKS, Size
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file, file_digest
 
@@ -56,7 +56,7 @@ def find_model(given: Path | None, url: str = MODEL_URL, expected: str = MODEL_S
     if path.is_file():
         if file_digest(path) != expected:
             raise RequestError(
-                f"{path}: not the expected file (sha256 differs); delete it, try again"
+                f"{path}: not the expected file (sha256 differs); delete it and retry"
             )
         return path
     try:
@@ -116,7 +116,7 @@ class FaceDetection:
     landmarks: np.ndarray
     head_pose: np.ndarray
 
-    def box(self, image_size: tuple[int, int]) -> tuple[np.ndarray, float]:
+    def box(self, image_size: Size) -> tuple[np.ndarray, float]:
         """Middle (2,) and width of the box around the face, in pixels."""
         points = self.landmarks[:, :2] * image_size
         low, high = points.min(axis=0), points.max(axis=0)
@@ -178,12 +178,10 @@ class FaceDetector:
         """Faces in ``image`` (H, W, 3) uint8 RGB; ``time`` in seconds matters in video mode."""
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(f"image must be (H, W, 3) uint8, not {image.dtype} {image.shape}")
-        mp_image = self._mediapipe.Image(
-            image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(image)
-        )
+        srgb = self._mediapipe.ImageFormat.SRGB
+        mp_image = self._mediapipe.Image(image_format=srgb, data=np.ascontiguousarray(image))
         # the inference threads announce themselves on the first image
-        quiet = contextlib.nullcontext() if self._warm else native_stderr_silenced()
-        with quiet:
+        with contextlib.nullcontext() if self._warm else native_stderr_silenced():
             if self._follows:
                 result = self._landmarker.detect_for_video(mp_image, round(time * 1000))
             else:
@@ -191,15 +189,12 @@ class FaceDetector:
         self._warm = True
         in_metres = np.ones((4, 4))
         in_metres[:3, 3] = CENTIMETRE
-        return [
-            FaceDetection(
-                np.array([(p.x, p.y, p.z) for p in points[:NUM_LANDMARKS]]),
-                np.array(matrix, dtype=float) * in_metres,
-            )
-            for points, matrix in zip(
-                result.face_landmarks, result.facial_transformation_matrixes, strict=True
-            )
-        ]
+        faces: list[FaceDetection] = []
+        poses = result.facial_transformation_matrixes
+        for points, matrix in zip(result.face_landmarks, poses, strict=True):
+            landmarks = np.array([(p.x, p.y, p.z) for p in points[:NUM_LANDMARKS]])
+            faces.append(FaceDetection(landmarks, np.array(matrix, dtype=float) * in_metres))
+        return faces
 
     def description(self) -> dict[str, Any]:
         """Detector, model and settings, for the record kept in a track."""

@@ -27,7 +27,7 @@ from face_prediction.tracking.geometry import (
     read_canonical_face,
     slerp,
 )
-from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, load_track
+from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, Size, load_track
 from face_prediction.tracking.video import VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
@@ -124,11 +124,8 @@ def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Sam
     weight = np.where(np.abs(wanted - times[after]) < SAME_TIME, 1.0, weight)
     between = (weight > 0.0) & (weight < 1.0)
     nearest = np.where(weight == 1.0, after, before)
-    valid = np.where(
-        between,
-        source.valid[before] & source.valid[after] & (gap <= max_gap + 1e-6),
-        source.valid[nearest],
-    )
+    bridged = source.valid[before] & source.valid[after] & (gap <= max_gap + 1e-6)
+    valid = np.where(between, bridged, source.valid[nearest])
 
     def mix(array: np.ndarray) -> np.ndarray:
         filled = np.nan_to_num(array)  # NaN * 0 would spoil a frame that does not need this one
@@ -194,16 +191,14 @@ class ZoomingDetector:
         if window is None or window == self._window:
             self._window = window
             return face
-        distances = [
-            (float(np.linalg.norm(closer.box(size)[0] - centre)), index, closer)
-            for index, closer in enumerate(self._through(window, image, time))
-        ]
-        if not distances or min(distances)[0] > width / 2:
+        faces = self._through(window, image, time)
+        distances = [float(np.linalg.norm(closer.box(size)[0] - centre)) for closer in faces]
+        if not distances or min(distances) > width / 2:
             self._window = None
             return face
         self._window = window
         self.windows += 1
-        return min(distances)[2]
+        return faces[int(np.argmin(distances))]
 
     def _through(self, window: Crop, image: np.ndarray, time: float) -> list[FaceDetection]:
         size = (image.shape[1], image.shape[0])
@@ -217,26 +212,22 @@ def is_well_inside(window: Crop, centre: np.ndarray, width: float) -> bool:
     """Return whether a face of this middle (2,) and width, in pixels, suits the window still."""
     middle = np.array([window.left, window.top]) + window.side / 2
     wanted = window.side / WINDOW_FACES
-    return bool(
-        np.all(np.abs(centre - middle) <= OFF_CENTRE * window.side)
-        and wanted / SIZE_CHANGE <= width <= wanted * SIZE_CHANGE
-    )
+    is_centred = bool(np.all(np.abs(centre - middle) <= OFF_CENTRE * window.side))
+    return is_centred and wanted / SIZE_CHANGE <= width <= wanted * SIZE_CHANGE
 
 
-def window_around(centre: np.ndarray, width: float, image_size: tuple[int, int]) -> Crop | None:
+def window_around(centre: np.ndarray, width: float, image_size: Size) -> Crop | None:
     """The window for a face of this middle (2,) and width in pixels; None for a large face."""
     longer, shorter = max(image_size), min(image_size)
     side = round(WINDOW_FACES * width)
     if width >= SMALL_FACE * longer or side >= shorter:
         return None
-    left, top = (
-        int(np.clip(round(c - side / 2), 0, length - side))
-        for c, length in zip(centre, image_size, strict=True)
-    )
+    pairs = zip(centre, image_size, strict=True)
+    left, top = (int(np.clip(round(c - side / 2), 0, length - side)) for c, length in pairs)
     return Crop(left, top, side)
 
 
-def search_windows(image_size: tuple[int, int]) -> list[Crop]:
+def search_windows(image_size: Size) -> list[Crop]:
     """Squares of half the shorter side that overlap by half, over the whole image."""
     side = min(image_size) // 2
     if side < 2:
@@ -249,7 +240,7 @@ def search_windows(image_size: tuple[int, int]) -> list[Crop]:
 
 
 def whole_image_detection(
-    face: FaceDetection, window: Crop, image_size: tuple[int, int], canonical: CanonicalFace
+    face: FaceDetection, window: Crop, image_size: Size, canonical: CanonicalFace
 ) -> FaceDetection:
     """A face found in ``window``, in the coordinates and under the camera of the whole image."""
     width, height = image_size
@@ -268,7 +259,7 @@ class FaceFollower:
         self.reacquired = 0
 
     def choose(
-        self, faces: Sequence[FaceDetection], time: float, image_size: tuple[int, int]
+        self, faces: Sequence[FaceDetection], time: float, image_size: Size
     ) -> FaceDetection | None:
         """The tracked face among ``faces`` at ``time`` seconds, or None when it is not there.
 
@@ -297,11 +288,8 @@ def extract_track(
 ) -> FaceTrack:
     """Read the video at ``path`` and follow one face through it.
 
-    Args:
-        path: the video.
-        detector: with the settings' detector settings.
-        settings: of the track.
-        label: of a progress bar; None: no bar.
+    ``detector`` has the settings' detector settings; ``label`` is that of a progress bar, None: no
+    bar.
 
     Raises:
         RequestError: the video cannot be read to its end.
@@ -309,16 +297,16 @@ def extract_track(
     """
     digest = file_digest(path)
     follower = FaceFollower()
-    zooming = None
+    detect, zooming = detector.detect, None
     if settings.zoom:
-        zooming = ZoomingDetector(detector.detect, read_canonical_face(detector.model))
-    detect = zooming.detect if zooming else detector.detect
+        zooming = ZoomingDetector(detect, read_canonical_face(detector.model))
+        detect = zooming.detect
     times: list[float] = []
     found: list[FaceDetection | None] = []
     several = 0
     size = (0, 0)
     with VideoReader(path) as video:
-        for frame in with_bar(video.frames(), video.info.expected_frames or None, label):
+        for frame in with_bar(video.frames(), video.expected_frames or None, label):
             height, width = frame.image.shape[:2]
             if times and (width, height) != size:
                 raise RequestError(f"{path}: its image size changes at {frame.time:.2f} s")
@@ -340,24 +328,12 @@ def extract_track(
         "reacquired": follower.reacquired,
         "frames_zoomed": zooming.frames if zooming else 0,
         "zoom_windows": zooming.windows if zooming else 0,
-        "average_rate": video.info.average_rate,
+        "average_rate": video.average_rate,
         # intervals that differ by more than 5 ms; container clocks tick more finely
         "variable_rate": bool(len(steps) > 1 and np.ptp(steps) > 0.005),
     }
     if source["frames_with_face"] == 0:
         raise NoFaceError(f"{path}: no face found in any of its {len(times)} frames")
-    return build_track(times, found, size, settings, source, detector.description())
-
-
-def build_track(
-    times: Sequence[float],
-    found: Sequence[FaceDetection | None],
-    image_size: tuple[int, int],
-    settings: ExtractSettings,
-    source: dict[str, Any],
-    detector: dict[str, Any],
-) -> FaceTrack:
-    """Put detections (one per decoded frame, None: no face) at a constant rate."""
     nowhere = FaceDetection(np.full((NUM_LANDMARKS, 3), np.nan), np.full((4, 4), np.nan))
     samples = Samples(
         timestamps=np.array(times),
@@ -378,13 +354,13 @@ def build_track(
         interpolated=interpolated,
         timestamps=track.timestamps,
         head_pose=track.head_pose,
-        jaw=jaw_openings(track.landmarks, track.head_pose, image_size).astype(np.float32),
-        image_size=image_size,
+        jaw=jaw_openings(track.landmarks, track.head_pose, size).astype(np.float32),
+        image_size=size,
         fps=float(fps),
         source_timestamps=samples.timestamps,
         source_valid=samples.valid,
         source=source,
-        detector=settings.record(detector),
+        detector=settings.record(detector.description()),
     )
 
 
@@ -402,6 +378,5 @@ def is_track_up_to_date(
         track = load_track(out)
     except RequestError as error:
         raise RequestError(f"{error}; it is in the way of a track, so remove it first") from None
-    return track.source.get("sha256") == source_hash and dict(track.detector) == settings.record(
-        detector
-    )
+    made_so = dict(track.detector) == settings.record(detector)
+    return made_so and track.source.get("sha256") == source_hash

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from face_prediction.tracking.tracks import NUM_LANDMARKS
+from face_prediction.tracking.tracks import NUM_LANDMARKS, Size
 from robo_manip_baselines.runs.errors import RequestError
 
 VERTICAL_FOV_DEGREES = 63.0
@@ -86,13 +86,13 @@ RIGID_LANDMARKS = (
 eight that move with the mouth: 132, 136, 147, 205 and their mirror images."""
 
 
-def view_size(image_size: tuple[int, int]) -> tuple[float, float]:
+def view_size(image_size: Size) -> tuple[float, float]:
     """Width and height of the image on the plane one unit ahead of the camera."""
     height = 2 * np.tan(np.radians(VERTICAL_FOV_DEGREES) / 2)
     return height * image_size[0] / image_size[1], height
 
 
-def image_rays(points: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+def image_rays(points: np.ndarray, image_size: Size) -> np.ndarray:
     """Directions (..., 3) in the camera frame, scaled to z = -1, of points (..., 2 or 3).
 
     ``points`` are normalised image coordinates (x right / width, y down / height).
@@ -104,7 +104,7 @@ def image_rays(points: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
 
 
 def points_on_mouth_plane(
-    points: np.ndarray, head_pose: np.ndarray, image_size: tuple[int, int]
+    points: np.ndarray, head_pose: np.ndarray, image_size: Size
 ) -> np.ndarray:
     """Intersections (T, P, 3) m of the rays of image points (T, P, 2 or 3) with the mouth's plane.
 
@@ -123,31 +123,24 @@ def points_on_mouth_plane(
     return rays * depth[..., None]
 
 
-def mouth_centres(
-    landmarks: np.ndarray, head_pose: np.ndarray, image_size: tuple[int, int]
-) -> np.ndarray:
+def mouth_centres(landmarks: np.ndarray, head_pose: np.ndarray, image_size: Size) -> np.ndarray:
     """Mouth centres (T, 3) in metres, camera frame: mean of the 40 lip points on their plane.
 
-    Args:
-        landmarks: (T, 468, 2 or 3) normalised image coordinates.
-        head_pose: (T, 4, 4) metres, camera from head.
-        image_size: (width, height) in pixels.
+    ``landmarks`` are (T, 468, 2 or 3) normalised image coordinates, ``head_pose`` (T, 4, 4) metres,
+    camera from head.
     """
     return points_on_mouth_plane(landmarks[:, list(LIPS)], head_pose, image_size).mean(axis=1)
 
 
-def jaw_openings(
-    landmarks: np.ndarray, head_pose: np.ndarray, image_size: tuple[int, int]
-) -> np.ndarray:
+def jaw_openings(landmarks: np.ndarray, head_pose: np.ndarray, image_size: Size) -> np.ndarray:
     """Distances (T,) in metres between the inner lips (13 and 14) on the mouth's plane."""
-    pair = points_on_mouth_plane(
-        landmarks[:, [UPPER_INNER_LIP, LOWER_INNER_LIP]], head_pose, image_size
-    )
+    lips = landmarks[:, [UPPER_INNER_LIP, LOWER_INNER_LIP]]
+    pair = points_on_mouth_plane(lips, head_pose, image_size)
     return np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1)
 
 
 def lift_landmarks(
-    landmarks: np.ndarray, valid: np.ndarray, image_size: tuple[int, int]
+    landmarks: np.ndarray, valid: np.ndarray, image_size: Size
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mouth centre (T, 3) m, head orientation (T, 4) wxyz, jaw opening (T,) m; NaN if not valid.
 
@@ -158,11 +151,8 @@ def lift_landmarks(
     pose = rigid_head_poses(landmarks, valid, image_size)
     orientation = np.full((len(valid), 4), np.nan)
     orientation[valid] = quaternion_from_matrix(pose[valid, :3, :3])
-    return (
-        mouth_centres(landmarks, pose, image_size),
-        orientation,
-        jaw_openings(landmarks, pose, image_size),
-    )
+    mouth = mouth_centres(landmarks, pose, image_size)
+    return mouth, orientation, jaw_openings(landmarks, pose, image_size)
 
 
 def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
@@ -176,16 +166,8 @@ def quaternion_from_matrix(matrix: np.ndarray) -> np.ndarray:
     trace = np.trace(m, axis1=-2, axis2=-1)
     k[..., 0, 0] = trace
     k[..., 1:, 1:] = m + np.swapaxes(m, -1, -2) - trace[..., None, None] * np.eye(3)
-    vector = np.stack(
-        [
-            m[..., 2, 1] - m[..., 1, 2],
-            m[..., 0, 2] - m[..., 2, 0],
-            m[..., 1, 0] - m[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    k[..., 0, 1:] = vector
-    k[..., 1:, 0] = vector
+    for i, (row, column) in enumerate(((2, 1), (0, 2), (1, 0)), start=1):
+        k[..., 0, i] = k[..., i, 0] = m[..., row, column] - m[..., column, row]
     _, vectors = np.linalg.eigh(k / 3.0)
     quaternion = vectors[..., :, -1]
     return np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
@@ -284,8 +266,7 @@ def _protobuf_fields(data: bytes) -> list[tuple[int, Any]]:
     fields: list[tuple[int, Any]] = []
     while at < len(data):
         key = varint()
-        wire = key & 7
-        if wire == 0:
+        if (wire := key & 7) == 0:
             fields.append((key >> 3, varint()))
             continue
         if wire not in (1, 2, 5):
@@ -306,9 +287,7 @@ def rigid_face() -> CanonicalFace:
     return CanonicalFace(vertices, weights)
 
 
-def rigid_head_poses(
-    landmarks: np.ndarray, valid: np.ndarray, image_size: tuple[int, int]
-) -> np.ndarray:
+def rigid_head_poses(landmarks: np.ndarray, valid: np.ndarray, image_size: Size) -> np.ndarray:
     """Poses (T, 4, 4) in metres, camera from head, of landmarks (T, L, 3); NaN where not valid."""
     face = rigid_face()
     poses = np.full((len(landmarks), 4, 4), np.nan)
@@ -318,7 +297,7 @@ def rigid_head_poses(
 
 
 def head_pose_from_landmarks(
-    landmarks: np.ndarray, image_size: tuple[int, int], face: CanonicalFace
+    landmarks: np.ndarray, image_size: Size, face: CanonicalFace
 ) -> np.ndarray:
     """Pose (4, 4) in metres, camera from head, of landmarks (L, 3) normalised to the image.
 
@@ -356,16 +335,13 @@ def _fit(
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of the image: left and top edge and side, whole pixels.
-
-    It may reach beyond the image.
-    """
+    """A square of the image, or beyond: left and top edge and side, whole pixels."""
 
     left: int
     top: int
     side: int
 
-    def normalise(self, landmarks: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    def normalise(self, landmarks: np.ndarray, image_size: Size) -> np.ndarray:
         """Crop coordinates (..., 3) of ``landmarks`` (..., 3), normalised image coordinates.
 
         Depth, given in image widths, becomes crop sides.
@@ -395,23 +371,19 @@ class Crop:
         scaled = cv2.resize(self.region(image), (size, size), interpolation=method)
         return np.asarray(scaled, dtype=np.uint8)
 
-    def padding(self, image_size: tuple[int, int]) -> float:
+    def padding(self, image_size: Size) -> float:
         """Share of the crop's area that lies outside the image, 0...1."""
         width = min(self.left + self.side, image_size[0]) - max(self.left, 0)
         height = min(self.top + self.side, image_size[1]) - max(self.top, 0)
         return 1.0 - max(width, 0) * max(height, 0) / self.side**2
 
 
-def crop_around(landmarks: np.ndarray, image_size: tuple[int, int], margin: float) -> Crop:
+def crop_around(landmarks: np.ndarray, image_size: Size, margin: float) -> Crop:
     """The crop around all faces of a stretch of frames.
 
     Its side is (1 + 2 margin) times the longer side of the box around every landmark of every
     frame, and its middle that of the box. Where the image is large enough it is moved inside.
-
-    Args:
-        landmarks: (T, L, 2 or 3) normalised image coordinates, all finite.
-        image_size: (width, height) in pixels.
-        margin: room on each side, in lengths of the box's longer side.
+    ``landmarks`` are (T, L, 2 or 3) normalised image coordinates, all finite.
     """
     size = np.array(image_size, dtype=np.float64)
     points = np.asarray(landmarks, dtype=np.float64)[..., :2].reshape(-1, 2) * size
@@ -423,7 +395,7 @@ def crop_around(landmarks: np.ndarray, image_size: tuple[int, int], margin: floa
     return Crop(int(corner[0]), int(corner[1]), side)
 
 
-def image_points(crop: Crop, points: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+def image_points(crop: Crop, points: np.ndarray, image_size: Size) -> np.ndarray:
     """Crop coordinates (..., 2) as normalised image coordinates (..., 2)."""
     corner = np.array([crop.left, crop.top], dtype=np.float64)
     return (np.asarray(points, dtype=np.float64) * crop.side + corner) / image_size

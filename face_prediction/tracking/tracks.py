@@ -21,6 +21,9 @@ VERSION = 1
 NUM_LANDMARKS = 468
 """MediaPipe's face mesh; the ten iris points that the detector adds are not kept."""
 
+Size = tuple[int, int]
+"""Width and height of an image in pixels, as displayed."""
+
 _ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "landmarks": ("float32", ("T", NUM_LANDMARKS, 3)),
     "valid": ("bool", ("T",)),
@@ -72,7 +75,7 @@ class FaceTrack:
     timestamps: np.ndarray
     head_pose: np.ndarray
     jaw: np.ndarray
-    image_size: tuple[int, int]
+    image_size: Size
     fps: float
     source_timestamps: np.ndarray
     source_valid: np.ndarray
@@ -104,31 +107,20 @@ def load_track(path: Path) -> FaceTrack:
             the message names the file and the key.
     """
     arrays = read_npz(path, SCHEMA, VERSION)
-    lengths = {
-        name: len(require_array(path, arrays, key, (None,), "b"))
-        for name, key in (("T", "valid"), ("S", "source_valid"))
-    }
-    values: dict[str, Any] = {
-        name: require_array(
-            path,
-            arrays,
-            name,
-            tuple(lengths[n] if isinstance(n, str) else n for n in shape),
-            np.dtype(dtype).kind.replace("i", "iu"),
-        )
-        for name, (dtype, shape) in _ARRAYS.items()
-    }
+    keys = {"T": "valid", "S": "source_valid"}
+    lengths = {n: len(require_array(path, arrays, key, (None,), "b")) for n, key in keys.items()}
+    values: dict[str, Any] = {}
+    for name, (dtype, shape) in _ARRAYS.items():
+        sizes = tuple(lengths[n] if isinstance(n, str) else n for n in shape)
+        kind = np.dtype(dtype).kind.replace("i", "iu")
+        values[name] = require_array(path, arrays, name, sizes, kind)
     values["image_size"] = tuple(values["image_size"].tolist())
     values["fps"] = float(values["fps"])
-    track = FaceTrack(
-        **values,
-        source=require_json(path, arrays, "source"),
-        detector=require_json(path, arrays, "detector"),
-    )
+    values |= {name: require_json(path, arrays, name) for name in ("source", "detector")}
+    track = FaceTrack(**values)
     if min(track.image_size) <= 0 or not (np.isfinite(track.fps) and track.fps > 0):
-        raise RequestError(
-            f"{path}: image_size {track.image_size} and fps {track.fps} must be positive"
-        )
+        wrong = f"image_size {track.image_size} and fps {track.fps}"
+        raise RequestError(f"{path}: {wrong} must be positive")
     if not np.all(np.isfinite(track.timestamps)) or np.any(np.diff(track.timestamps) <= 0):
         raise RequestError(f"{path}: 'timestamps' must be finite and increasing")
     for key in ("landmarks", "head_pose"):

@@ -25,20 +25,8 @@ class VideoFrame:
     image: np.ndarray
 
 
-@dataclass(frozen=True)
-class VideoInfo:
-    """Header of a video. ``expected_frames`` is 0 where the header does not give it."""
-
-    expected_frames: int
-    average_rate: float
-
-
 def require_video(path: Path) -> None:
-    """Check that ``path`` is a file that can be read.
-
-    Raises:
-        RequestError: it is absent, a folder, empty or unreadable.
-    """
+    """Raise RequestError if ``path`` is absent, a folder, empty or unreadable."""
     if path.is_dir():
         raise RequestError(f"{path}: is a folder; name video files")
     if not path.exists():
@@ -55,6 +43,10 @@ def require_video(path: Path) -> None:
 class VideoReader:
     """Reads one video with PyAV. Use as a context manager.
 
+    Attributes:
+        expected_frames: frames by the header; 0 where it does not give them.
+        average_rate: frames per second by the header; 0 where it does not give it.
+
     Raises:
         RequestError: the file is no video, holds no video stream, or breaks off before its end;
             the message names the file.
@@ -69,9 +61,8 @@ class VideoReader:
         try:
             self._container = av.open(str(path))
         except (FFmpegError, OSError) as error:
-            raise RequestError(
-                f"{path}: cannot be opened as a video ({error.strerror}); truncated, or not a video"
-            ) from None
+            wrong = f"cannot be opened as a video ({error.strerror}); truncated, or not a video"
+            raise RequestError(f"{path}: {wrong}") from None
         if not self._container.streams.video:
             self._container.close()
             raise RequestError(f"{path}: holds no video stream")
@@ -84,7 +75,8 @@ class VideoReader:
             expected = int(stream.duration * stream.time_base * stream.average_rate)
         elif stream.average_rate and self._container.duration and len(self._container.streams) == 1:
             expected = int(self._container.duration / 1e6 * float(stream.average_rate))
-        self.info = VideoInfo(expected, float(stream.average_rate or stream.guessed_rate or 0.0))
+        self.expected_frames = expected
+        self.average_rate = float(stream.average_rate or stream.guessed_rate or 0.0)
 
     def __enter__(self) -> VideoReader:
         return self
@@ -105,9 +97,8 @@ class VideoReader:
         try:
             for packet in self._container.demux(self._stream):
                 if packet.is_corrupt:
-                    raise RequestError(
-                        f"{self._path}: breaks off after {count} frames; truncated or damaged"
-                    )
+                    wrong = f"breaks off after {count} frames; truncated or damaged"
+                    raise RequestError(f"{self._path}: {wrong}")
                 for frame in packet.decode():
                     count += 1
                     if frame.time is None or frame.time <= last:
@@ -116,16 +107,11 @@ class VideoReader:
                     image = frame.to_ndarray(format="rgb24")
                     yield VideoFrame(last, upright(image, frame.rotation))
         except FFmpegError as error:
-            raise RequestError(
-                f"{self._path}: breaks off after {count} frames ({error.strerror}); "
-                "truncated or damaged"
-            ) from None
-        expected = self.info.expected_frames
-        if count < WHOLE_SHARE * expected:
-            raise RequestError(
-                f"{self._path}: truncated, its header promises {expected} frames "
-                f"and {count} can be decoded"
-            )
+            wrong = f"breaks off after {count} frames ({error.strerror}); truncated or damaged"
+            raise RequestError(f"{self._path}: {wrong}") from None
+        if count < WHOLE_SHARE * self.expected_frames:
+            wrong = f"its header promises {self.expected_frames} frames and {count} can be decoded"
+            raise RequestError(f"{self._path}: truncated, {wrong}")
         if count == 0:
             raise RequestError(f"{self._path}: holds no frame that can be decoded")
 
@@ -143,9 +129,6 @@ def upright(image: np.ndarray, rotation: int) -> np.ndarray:
 def with_bar(
     frames: Iterable[VideoFrame], total: int | None, label: str | None
 ) -> Iterable[VideoFrame]:
-    """Pass on ``frames`` under a progress bar called ``label``; None: without a bar.
-
-    ``total`` is the number of frames, None where it is not known.
-    """
-    shown = label is not None
-    return tqdm(frames, total=total, desc=label, unit="frame", leave=False, disable=not shown)
+    """Pass on ``frames`` (``total``, if known) under a progress bar ``label``; None: no bar."""
+    disable = label is None
+    return tqdm(frames, total=total, desc=label, unit="frame", leave=False, disable=disable)

@@ -50,7 +50,7 @@ class FaceTrainOptions:
         augment: Mirror half of the sequences, and change position and light.
         precision: bf16 (autocast), fp32, or auto: bf16 on a GPU.
         validate_every: Steps between validations on the held-out fold.
-        validation_sequences: Sequences of that fold used for it; 0: all.
+        validation_sequences: Sequences of that fold used for it, evenly spread; 0: all.
         device: auto: the GPU if there is one; or cpu, cuda, cuda:1.
         memory_gb: Memory for decoded images in GB; beyond it they are decoded every time.
         log_every: Steps between lines of metrics.jsonl.
@@ -111,7 +111,7 @@ class FaceTrainOptions:
 
 
 def _parsed(settings: tuple[str, ...]) -> dict[str, Any]:
-    values: dict[str, Any] = {}
+    values = {}
     for text in settings:
         name, equals, value = text.partition("=")
         if not equals:

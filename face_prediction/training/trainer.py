@@ -1,8 +1,8 @@
-"""The training loop, and the state that it saves to go on exactly.
+"""A training run: people, network and folder, new or carried on, and the loop.
 
-``trainer.safetensors`` holds ``weights/NAME``, ``average/NAME`` (with a moving average),
-``best/NAME`` (once a held-out fold has chosen), Adam's moments ``adam/NAME/...``, and a record:
-what is trained, and `TrainerProgress`.
+``trainer.safetensors`` is the state to go on from exactly: ``weights/NAME``, ``average/NAME`` (with
+a moving average), ``best/NAME`` (once a held-out fold has chosen), Adam's moments
+``adam/NAME/...``, and a record: what is trained, and `TrainerProgress`.
 """
 
 from __future__ import annotations
@@ -11,43 +11,189 @@ import contextlib
 import copy
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
+from tqdm.contrib.logging import logging_redirect_tqdm
 
-from face_prediction.models.checkpoint import (
+from face_prediction.dataset.manifest import MANIFEST_NAME
+from face_prediction.dataset.reader import FaceDataset
+from face_prediction.models.interface import PredictorModel
+from face_prediction.models.learned import (
+    MODEL_FILE,
     CheckpointRecord,
     load_tensors,
+    read_predictor_checkpoint,
     read_tensors,
     require_kind,
     save_predictor_checkpoint,
     write_tensors,
 )
-from face_prediction.models.interface import PredictorModel
-from face_prediction.models.settings import PredictorTrainSettings
+from face_prediction.models.settings import PredictorTrainSettings, make_predictor_model
+from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.options import FaceTrainOptions
-from face_prediction.training.validation import HeldOutLoss, selection_error
-from face_prediction.training.windows import SequenceWindows, augment, window_batches
+from face_prediction.training.windows import SequenceWindows, WindowBatch, augment, window_batches
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest, locked, remove_temporaries
 from robo_manip_baselines.runs.interrupt import StopRequest
-from robo_manip_baselines.runs.metrics import MetricsLog
+from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import stream_generator
+from robo_manip_baselines.runs.versions import software_versions
 
 KIND = {"schema": "face_trainer", "version": 1}
 TRAINER_FILE = "trainer.safetensors"
 METRICS_FILE = "metrics.jsonl"
+CURVES = {
+    "loss": ("loss",),
+    "error of the mouth centre, crops": ("mouth_error", "persistence_mouth_error"),
+}
+"""Panels of ``curves.png``."""
+_VALIDATION_SHARE = 0.25  # of the memory for images, for the held-out fold
 
 logger = logging.getLogger(__name__)
 
 
+def train_predictor(options: FaceTrainOptions) -> int:
+    """Train a network, or carry on; see `run_train`."""
+    model_settings, settings = options.resolved()
+    device = _device(options.device)
+    folder = options.folder
+    with ExitStack() as stack:
+        stack.enter_context(logging_redirect_tqdm())
+        # one for each thread that reads: training's images are read ahead
+        dataset, held_out = (stack.enter_context(FaceDataset(options.dataset)) for _ in range(2))
+        people = choose_people(dataset, options)
+        torch.manual_seed(torch_seed(options.seed, "weights"))
+        model = make_predictor_model(options.model, model_settings)
+        frames = dataset.manifest.settings
+        if model.history > frames.history or model.horizon > frames.future:
+            raise RequestError(
+                f"{dataset.folder}: sequences of {frames.history} + {frames.future} frames, this "
+                f"network needs {model.history} + {model.horizon}; make the dataset with --history "
+                f"{model.history} --future {model.horizon}"
+            )
+        record = CheckpointRecord(
+            model=options.model,
+            settings=model_settings.to_json(),
+            preset=options.preset,
+            training=asdict(settings),
+            seed=options.seed,
+            dataset=frames.to_json(),
+            dataset_sha256=file_digest(options.dataset / MANIFEST_NAME),
+            folds=people.folds,
+            train_subjects=people.train_subjects,
+            step=0,
+            validation={},
+            versions=software_versions("torch"),
+        )
+        stack.enter_context(locked(folder))
+        remove_temporaries(folder)
+        found = _previous_state(folder, record)
+        if found and found[1].step == settings.steps:
+            _require_result(folder, record, *found)
+            logger.info("%s: finished already, %d steps", folder, settings.steps)
+            return 0
+        stop = stack.enter_context(StopRequest())
+        memory = options.memory_gb * 1e9
+        validation = None
+        if count := len(people.validation):
+            used = min(settings.validation_sequences or count, count)
+            rows = people.validation[np.linspace(0, count - 1, used).astype(int)]
+            validation = SequenceWindows(held_out, rows, model, memory * _VALIDATION_SHARE)
+            memory *= 1 - _VALIDATION_SHARE
+        windows = SequenceWindows(dataset, people.train, model, memory)
+        if found is None:
+            generator = torch.Generator().manual_seed(torch_seed(options.seed, "prepare"))
+            model.prepare(windows.sequences, generator)
+        trainer = PredictorTrainer(options, settings, record, model.to(device), windows, validation)
+        if found is not None:
+            trainer.restore(*found)
+        logger.info(
+            "%s: %d sequences of %d people, %d held out; step %d of %d on %s",
+            *(folder, len(windows), len(people.train_subjects), count),
+            *(trainer.progress.step, settings.steps, device),
+        )
+        trainer.train(stop)
+    write_curves(folder / "curves.png", read_metrics(folder / METRICS_FILE), folder.name, CURVES)
+    end = "stopped; the same command carries on" if stop.is_made else "done"
+    logger.info("%s: %s", folder, end)
+    return 130 if stop.is_made else 0
+
+
+@dataclass(frozen=True)
+class People:
+    """Sequences to train on and to validate on; never one person in both.
+
+    Attributes:
+        train: (N,) sequences of the dataset.
+        validation: (M,) sequences; empty where nobody is held out.
+        folds: folds by use: ``train``, ``validation``, ``test``.
+        train_subjects: people trained on.
+    """
+
+    train: NDArray[np.int64]
+    validation: NDArray[np.int64]
+    folds: dict[str, list[int]]
+    train_subjects: list[str]
+
+
+def choose_people(dataset: FaceDataset, options: FaceTrainOptions) -> People:
+    """Divide the dataset by ``test_fold``, ``hold_out``, ``subjects`` and ``seed`` of the options.
+
+    Raises:
+        RequestError: there is no such fold, nobody to train on, or fewer subjects.
+    """
+    count = dataset.manifest.folds
+    train, validation, test = tuple(range(count)), (), ()
+    if options.test_fold is not None:
+        split = dataset.split(options.test_fold)
+        train, validation, test = split.train, split.validation, split.test
+        if options.hold_out == "none":
+            train, validation = tuple(sorted({*train, *validation})), ()
+        elif not validation:
+            raise RequestError(
+                f"{dataset.folder}: {count} folds leave none to hold out; say --hold_out none"
+            )
+    elif options.hold_out == "next":
+        raise RequestError("--test_fold None trains on everybody; say --hold_out none with it")
+    rows = dataset.indices(folds=train)
+    owners = [dataset.entry(int(row)).subject for row in rows]
+    names = sorted(set(owners))
+    if not names:
+        raise RequestError(f"{dataset.folder}: nobody to train on in folds {list(train)}")
+    if (subjects := options.subjects) is not None:
+        if not 1 <= subjects <= len(names):
+            raise RequestError(f"--subjects {subjects}: the folds to train on have {len(names)}")
+        order = stream_generator(options.seed, "subjects").permutation(len(names))
+        names = sorted(names[place] for place in order[:subjects])
+        rows = rows[[owner in names for owner in owners]]
+    folds = {"train": list(train), "validation": list(validation), "test": list(test)}
+    return People(rows, dataset.indices(folds=validation), folds, names)
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError):
+        choices = "auto, cpu" + ", cuda" * torch.cuda.is_available()
+        raise RequestError(f"--device {name}: not there; valid: {choices}") from None
+    return device
+
+
 @dataclass
 class TrainerProgress:
-    """How far a run has come.
+    """Progress of a run.
 
     Attributes:
         step: optimizer steps done.
@@ -64,6 +210,73 @@ class TrainerProgress:
     rows: list[list[float]] = field(default_factory=list)
     best_step: int | None = None
     best: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def result_step(self) -> int:
+        """Step whose weights are the result: the best on a held-out fold, else the last."""
+        return self.step if self.best_step is None else self.best_step
+
+
+def _previous_state(
+    folder: Path, record: CheckpointRecord
+) -> tuple[dict[str, Tensor], TrainerProgress] | None:
+    """Return the state of the run in ``folder``, if there is one; it must be this run."""
+    path = folder / TRAINER_FILE
+    if not path.exists():
+        if (folder / MODEL_FILE).exists():
+            raise RequestError(
+                f"--out {folder}: holds a network, but no {TRAINER_FILE} to carry on from; "
+                "choose another folder"
+            )
+        (folder / METRICS_FILE).unlink(missing_ok=True)
+        return None
+    tensors, state, _ = read_tensors(path)
+    require_kind(path, state, KIND)
+    for name, old, new in _differences(state["run"], _run_record(record)):
+        raise RequestError(
+            f"--out {folder}: holds a run with {name} {old}, not {new}; "
+            "choose another folder, or give the same options"
+        )
+    return tensors, TrainerProgress(**state["progress"])
+
+
+def _run_record(record: CheckpointRecord) -> dict[str, Any]:
+    """Return what must be the same when a run is carried on."""
+    left_out = ("step", "validation", "versions")
+    return {name: value for name, value in asdict(record).items() if name not in left_out}
+
+
+def _differences(there: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    if isinstance(there, dict) and isinstance(now, dict):
+        for key in now | there:
+            inner = f"{name}.{key}" if name else str(key)
+            yield from _differences(there.get(key), now.get(key), inner)
+    elif there != now:
+        yield name, there, now
+
+
+def _require_result(
+    folder: Path, record: CheckpointRecord, tensors: dict[str, Tensor], progress: TrainerProgress
+) -> None:
+    """Write the network of a finished run again, if it was killed while writing it."""
+    try:
+        if read_predictor_checkpoint(folder)[0].step == progress.result_step:
+            return
+    except RequestError as error:
+        logger.warning("%s", error)
+        logger.warning("%s: the network is written again from %s", folder, TRAINER_FILE)
+    _save_result(folder, record, tensors, progress)
+
+
+def _save_result(
+    folder: Path, record: CheckpointRecord, tensors: Mapping[str, Tensor], progress: TrainerProgress
+) -> None:
+    """Write the network of `result_step` from a trainer's tensors; the last one is averaged."""
+    state = _without("best/", tensors)
+    if progress.best_step is None:
+        state = _without("average/", tensors) or _without("weights/", tensors)
+    record = replace(record, step=progress.result_step, validation=progress.best)
+    save_predictor_checkpoint(folder, record, state)
 
 
 class StepMeans:
@@ -106,11 +319,7 @@ class PredictorTrainer:
         record: what is trained on what; ``step`` and ``validation`` are filled in.
         model: on its device, prepared.
         windows: to train on.
-        validation: on the held-out fold; None: nobody is held out, and the last weights are kept.
-
-    Attributes:
-        average: network with the moving average of the weights, or None.
-        progress: how far the run has come.
+        validation: of the held-out fold; None: nobody is held out, and the last weights are kept.
     """
 
     def __init__(
@@ -120,12 +329,12 @@ class PredictorTrainer:
         record: CheckpointRecord,
         model: PredictorModel,
         windows: SequenceWindows,
-        validation: HeldOutLoss | None,
+        validation: SequenceWindows | None,
     ) -> None:
-        self.average = copy.deepcopy(model).eval() if settings.ema_decay else None
         self.progress = TrainerProgress()
         self._options, self._settings, self._record = options, settings, record
         self._model, self._windows, self._validation = model, windows, validation
+        self._average = copy.deepcopy(model).eval() if settings.ema_decay else None
         self._optimizer = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
         self._device = next(model.parameters()).device
         precisions = ("auto", "bf16") if self._device.type == "cuda" else ("bf16",)
@@ -143,13 +352,8 @@ class PredictorTrainer:
         """
         options, settings, seed = self._options, self._settings, self._options.seed
         model, optimizer, progress = self._model, self._optimizer, self.progress
-        bar = StepProgress(
-            settings.steps,
-            progress.step,
-            progress.seconds,
-            shown=options.progress,
-            log_every=options.log_every,
-        )
+        done = (settings.steps, progress.step, progress.seconds)
+        bar = StepProgress(*done, shown=options.progress, log_every=options.log_every)
         batches = window_batches(
             self._windows, settings.batch_size, seed, progress.step, settings.steps
         )
@@ -161,8 +365,9 @@ class PredictorTrainer:
                 moved = batch.to(self._device)
                 if settings.augment:
                     moved = augment(moved, stream_generator(seed, "augment", step))
+                rate = settings.learning_rate_at(step)
                 for group in optimizer.param_groups:
-                    group["lr"] = settings.learning_rate_at(step)
+                    group["lr"] = rate
                 torch.manual_seed(torch_seed(seed, "dropout", step))
                 model.train()
                 with self._autocast:
@@ -180,12 +385,11 @@ class PredictorTrainer:
                 if bar.is_due(options.log_every):
                     numbers = self._means.take()
                     self._require_finite(numbers["loss"])
-                    rate = settings.learning_rate_at(step)
                     numbers |= {"learning_rate": rate, "seconds": bar.seconds}
                     log.write("train", progress.step, numbers)
                     bar.report(numbers["loss"])
                 if self._validation and bar.is_due(settings.validate_every):
-                    numbers = self._validation(self.average or model, self._autocast)
+                    numbers = self._validate(self._validation)
                     log.write("validation", progress.step, numbers)
                     self._keep_best(numbers)
                 if bar.is_due(options.checkpoint_every) or is_stopping:
@@ -195,15 +399,15 @@ class PredictorTrainer:
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor], progress: TrainerProgress) -> None:
-        """Go on from where another trainer was, as `read_trainer_state` returns it.
+        """Go on from the state that another trainer saved.
 
         Raises:
             RequestError: the tensors do not fit the network.
         """
         path = self._options.folder / TRAINER_FILE
         load_tensors(self._model, _without("weights/", tensors), path)
-        if self.average is not None:
-            load_tensors(self.average, _without("average/", tensors), path)
+        if self._average is not None:
+            load_tensors(self._average, _without("average/", tensors), path)
         for name, parameter in self._model.named_parameters():
             if moments := _without(f"adam/{name}/", tensors):
                 self._optimizer.state[parameter] = {
@@ -218,40 +422,67 @@ class PredictorTrainer:
 
     @torch.no_grad()
     def _update_average(self, step: int) -> None:
-        if self.average is None:
+        if self._average is None:
             return
         decay = min(self._settings.ema_decay, (1 + step) / (10 + step))  # short at first
-        for mean, new in zip(self.average.parameters(), self._model.parameters(), strict=True):
+        for mean, new in zip(self._average.parameters(), self._model.parameters(), strict=True):
             mean.lerp_(new, 1 - decay)
-        for mean, new in zip(self.average.buffers(), self._model.buffers(), strict=True):
+        for mean, new in zip(self._average.buffers(), self._model.buffers(), strict=True):
             mean.copy_(new)
 
+    def _validate(self, windows: SequenceWindows) -> dict[str, float]:
+        """Return means over the sequences of the held-out fold, each at the end of its history.
+
+        ``loss`` and its terms; ``mouth_error``, the distance of the mouth centre in crops over all
+        predicted frames (of a network that predicts landmarks), and beside it
+        ``persistence_mouth_error``, that of predicting no motion; ``copy_image``, the squared error
+        of the last image as a prediction.
+        """
+        model = (self._average or self._model).eval()
+        sums: dict[str, list[float]] = {}
+        for first in range(0, len(windows), self._settings.batch_size):
+            rows = np.arange(first, min(first + self._settings.batch_size, len(windows)))
+            batch = windows.batch(rows, np.full(len(rows), windows.validation_start))
+            with torch.inference_mode(), self._autocast:
+                moved = batch.to(self._device)
+                losses = model.loss(*moved)
+                numbers = {"loss": float(losses.total)}
+                numbers |= {name: float(value) for name, value in losses.terms.items()}
+                numbers |= _mouth_errors(batch, model(moved.history).landmarks)
+            if batch.history.images.shape[1]:
+                change = (batch.future.images.float() - batch.history.images[:, -1:].float()) / 255
+                numbers["copy_image"] = float(change.square().mean())
+            for name, value in numbers.items():
+                sums.setdefault(name, []).append(len(rows) * value)
+        return {name: math.fsum(values) / len(windows) for name, values in sums.items()}
+
     def _keep_best(self, numbers: dict[str, float]) -> None:
-        error = selection_error(numbers)
+        error = _selection_error(numbers)
         self._require_finite(error)
         progress = self.progress
-        if progress.best_step is None or error < selection_error(progress.best):
+        if progress.best_step is None or error < _selection_error(progress.best):
             progress.best_step, progress.best = progress.step, numbers
-            state = (self.average or self._model).state_dict()
+            state = (self._average or self._model).state_dict()
             self._best = {name: tensor.detach().clone() for name, tensor in state.items()}
 
     def _save(self, seconds: float) -> None:
         """Write the trainer's state, and the network that is the result so far."""
-        progress = self.progress
+        progress, folder = self.progress, self._options.folder
         progress.names, progress.rows = self._means.names, self._means.rows()
         progress.seconds = seconds
         self._require_finite(sum(row[0] for row in progress.rows))
-        tensors = _prefixed("weights/", self._model.state_dict())
-        if self.average is not None:
-            tensors |= _prefixed("average/", self.average.state_dict())
-        tensors |= _prefixed("best/", self._best)
+        parts = {"weights/": self._model.state_dict()}
+        if self._average is not None:
+            parts["average/"] = self._average.state_dict()
+        parts["best/"] = dict(self._best)
         for name, parameter in self._model.named_parameters():
-            tensors |= _prefixed(f"adam/{name}/", self._optimizer.state.get(parameter, {}))
-        record = {**KIND, "run": run_record(self._record), "progress": asdict(progress)}
-        write_tensors(self._options.folder / TRAINER_FILE, tensors, record)
+            parts[f"adam/{name}/"] = self._optimizer.state.get(parameter, {})
+        tensors = {f"{prefix}{k}": v for prefix, part in parts.items() for k, v in part.items()}
+        record = {**KIND, "run": _run_record(self._record), "progress": asdict(progress)}
+        write_tensors(folder / TRAINER_FILE, tensors, record)
         self._saved_step = progress.step
         if self._validation is None or progress.best_step is not None:
-            save_result(self._options.folder, self._record, tensors, progress)
+            _save_result(folder, self._record, tensors, progress)
 
     def _require_finite(self, number: float) -> None:
         if not math.isfinite(number):
@@ -261,46 +492,25 @@ class PredictorTrainer:
             )
 
 
+def _mouth_errors(batch: WindowBatch, predicted: Tensor | None) -> dict[str, float]:
+    truth = batch.future.landmarks
+    still = batch.history.landmarks[:, -1:].expand_as(truth)
+    numbers = {}
+    for name, landmarks in (("mouth_error", predicted), ("persistence_mouth_error", still)):
+        if landmarks is not None:
+            residuals = mouth_residuals(landmarks.float().cpu().numpy(), truth.numpy())
+            numbers[name] = float(mouth_distances(residuals).mean())
+    return numbers
+
+
+def _selection_error(numbers: dict[str, float]) -> float:
+    """Return the number by which the best weights are chosen: mouth error, or else loss."""
+    return numbers.get("mouth_error", numbers["loss"])
+
+
 def torch_seed(seed: int, stream: str, *numbers: int) -> int:
     """Return a seed of a named stream for PyTorch."""
     return int(stream_generator(seed, stream, *numbers).integers(2**63))
-
-
-def run_record(record: CheckpointRecord) -> dict[str, Any]:
-    """Return what must be the same when a run is carried on."""
-    left_out = ("step", "validation", "versions")
-    return {name: value for name, value in asdict(record).items() if name not in left_out}
-
-
-def read_trainer_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], TrainerProgress]:
-    """Read a trainer's tensors, `run_record` and progress.
-
-    Raises:
-        RequestError: the file is damaged or of another schema.
-    """
-    tensors, record, _ = read_tensors(path)
-    require_kind(path, record, KIND)
-    return tensors, record["run"], TrainerProgress(**record["progress"])
-
-
-def result_step(progress: TrainerProgress) -> int:
-    """Return the step whose weights are the result: the best on a held-out fold, else the last."""
-    return progress.step if progress.best_step is None else progress.best_step
-
-
-def save_result(
-    folder: Path, record: CheckpointRecord, tensors: Mapping[str, Tensor], progress: TrainerProgress
-) -> None:
-    """Write the network of `result_step` from a trainer's tensors; the last one is averaged."""
-    state = _without("best/", tensors)
-    if progress.best_step is None:
-        state = _without("average/", tensors) or _without("weights/", tensors)
-    record = replace(record, step=result_step(progress), validation=progress.best)
-    save_predictor_checkpoint(folder, record, state)
-
-
-def _prefixed(prefix: str, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
-    return {f"{prefix}{name}": tensor for name, tensor in tensors.items()}
 
 
 def _without(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

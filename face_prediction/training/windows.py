@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -47,16 +48,15 @@ class SequenceImages:
     """
 
     def __init__(self, dataset: FaceDataset, size: int, memory: float) -> None:
-        crop = dataset.manifest.settings.crop_size
-        self._length = dataset.manifest.settings.length
+        settings = dataset.manifest.settings
+        crop, self._length = settings.crop_size, settings.length
         self._reduce = crop // size
         if crop != size * self._reduce or self._reduce not in (1, 2, 4, 8):
             raise RequestError(
                 f"{dataset.folder}: pictures of {crop} pixels, but this network needs {size} "
                 f"(or 2, 4 or 8 times that); make the dataset with --crop_size {size}"
             )
-        self._dataset = dataset
-        self._size = size
+        self._dataset, self._size = dataset, size
         self._frames_left = int(memory // (3 * size * size))
         self._kept: dict[int, tuple[NDArray[np.uint8], NDArray[np.bool_]]] = {}
 
@@ -68,7 +68,7 @@ class SequenceImages:
         """
         if index not in self._kept:
             if self._frames_left < self._length:
-                return self._dataset.pictures(index, slice(start, stop), self._reduce)
+                return self._dataset.images(index, slice(start, stop), self._reduce)
             shape = (self._length, self._size, self._size, 3)
             self._kept[index] = np.empty(shape, np.uint8), np.zeros(self._length, dtype=bool)
             self._frames_left -= self._length
@@ -76,11 +76,12 @@ class SequenceImages:
         missing = np.flatnonzero(~is_decoded[start:stop])
         if len(missing):
             frames = slice(start + int(missing[0]), start + int(missing[-1]) + 1)
-            images[frames] = self._dataset.pictures(index, frames, self._reduce)
+            images[frames] = self._dataset.images(index, frames, self._reduce)
             is_decoded[frames] = True
         return images[start:stop]
 
 
+@dataclass(frozen=True)
 class WindowSampler:
     """Batches of (sequence, first frame of its window), a pure function of seed and step.
 
@@ -88,33 +89,32 @@ class WindowSampler:
     without a gap, so that every batch is full. Where a window (history and horizon) is shorter
     than the sequences, it lies anywhere in them.
 
-    Args:
-        sequences: number of them.
-        length: frames of each.
+    Attributes:
+        sequences: number of them, each of ``length`` frames.
         window: frames of a window.
-        batch_size: of a batch.
+        batch_size: windows of a batch.
         seed: of the run.
     """
 
-    def __init__(
-        self, sequences: int, length: int, window: int, batch_size: int, seed: int
-    ) -> None:
-        self._sequences = sequences
-        self._last_start = length - window
-        self._batch_size = batch_size
-        self._seed = seed
-        self._order = lru_cache(maxsize=2)(self._draw_order)
+    sequences: int
+    length: int
+    window: int
+    batch_size: int
+    seed: int
 
     def batch(self, step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return sequences (B,) of 0...N - 1 and first frames (B,) of the batch of ``step``."""
-        places = step * self._batch_size + np.arange(self._batch_size)
-        epochs, ranks = np.divmod(places, self._sequences)
-        rows = np.array([self._order(int(e))[r] for e, r in zip(epochs, ranks, strict=True)])
-        generator = stream_generator(self._seed, "window", step)
-        return rows, generator.integers(self._last_start + 1, size=self._batch_size)
+        places = step * self.batch_size + np.arange(self.batch_size)
+        epochs, ranks = np.divmod(places, self.sequences)
+        orders = [_epoch_order(self.sequences, self.seed, int(epoch)) for epoch in epochs]
+        rows = np.array([order[rank] for order, rank in zip(orders, ranks, strict=True)])
+        generator = stream_generator(self.seed, "window", step)
+        return rows, generator.integers(self.length - self.window + 1, size=self.batch_size)
 
-    def _draw_order(self, epoch: int) -> NDArray[np.int64]:
-        return stream_generator(self._seed, "order", epoch).permutation(self._sequences)
+
+@lru_cache(maxsize=2)
+def _epoch_order(sequences: int, seed: int, epoch: int) -> NDArray[np.int64]:
+    return stream_generator(seed, "order", epoch).permutation(sequences)
 
 
 class WindowBatch(NamedTuple):
@@ -127,11 +127,8 @@ class WindowBatch(NamedTuple):
         """Return the batch on ``device``."""
         if device.type == "cpu":
             return self
-        moved = [
-            tensor.pin_memory().to(device, non_blocking=True)
-            for part in self
-            for tensor in (part.landmarks, part.images)
-        ]
+        tensors = [t for part in self for t in (part.landmarks, part.images)]
+        moved = [tensor.pin_memory().to(device, non_blocking=True) for tensor in tensors]
         return WindowBatch(History(*moved[:2]), Future(*moved[2:]))
 
 
@@ -147,6 +144,7 @@ class SequenceWindows:
     Attributes:
         sequences: their landmarks, whole.
         frames: of a window.
+        validation_start: first frame of the windows whose history ends where the dataset's does.
 
     Raises:
         RequestError: a file is damaged, or its images do not fit.
@@ -155,16 +153,15 @@ class SequenceWindows:
     def __init__(
         self, dataset: FaceDataset, indices: NDArray[np.int64], model: PredictorModel, memory: float
     ) -> None:
-        self._indices = indices
-        self._history = model.history
-        self._seen = model.needs.frames
-        self._images = self._seen + (model.horizon if model.makes_images else 0)
-        self._size = model.needs.size
-        self._store = SequenceImages(dataset, self._size, memory) if self._images else None
-        points = [dataset.landmarks(int(index))[..., :2] for index in indices]
+        self._indices, self._history = indices.tolist(), model.history
+        self._seen, self._size = model.needs.frames, model.needs.size
+        self._images = self._seen + model.horizon
+        self._store = SequenceImages(dataset, self._size, memory)
         self.frames = model.history + model.horizon
-        subjects = tuple(dataset.entry(int(index)).subject for index in indices)
-        self.sequences = LandmarkSequences(np.stack(points), subjects)
+        self.validation_start = dataset.manifest.settings.history - model.history
+        points = np.stack([dataset.landmarks(index)[..., :2] for index in self._indices])
+        subjects = tuple(dataset.entry(index).subject for index in self._indices)
+        self.sequences = LandmarkSequences(points, subjects)
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -178,17 +175,13 @@ class SequenceWindows:
         frames = starts[:, None] + np.arange(self.frames)
         landmarks = torch.from_numpy(self.sequences.landmarks[rows[:, None], frames])
         images = np.empty((len(rows), self._images, self._size, self._size, 3), dtype=np.uint8)
-        if self._store is not None:
-            # one read: the images of history and future are neighbours
-            firsts = starts + self._history - self._seen
-            for place, (row, first) in enumerate(zip(rows, firsts.tolist(), strict=True)):
-                index = int(self._indices[row])
-                images[place] = self._store.read(index, first, first + self._images)
+        # one read: the images of history and future are neighbours
+        firsts = (starts + self._history - self._seen).tolist()
+        for place, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+            images[place] = self._store.read(self._indices[row], first, first + self._images)
         seen, coming = torch.from_numpy(images).tensor_split([self._seen], dim=1)
-        return WindowBatch(
-            History(landmarks[:, : self._history], seen),
-            Future(landmarks[:, self._history :], coming),
-        )
+        past, ahead = landmarks.tensor_split([self._history], dim=1)
+        return WindowBatch(History(past, seen), Future(ahead, coming))
 
 
 def window_batches(

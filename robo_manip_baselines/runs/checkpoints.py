@@ -38,12 +38,9 @@ def step_folder(run: Path, step: int) -> Path:
 def list_checkpoints(run: Path) -> list[tuple[int, Path]]:
     """The complete checkpoints of a run folder as (step, folder), oldest first."""
     parent = run / CHECKPOINTS
-    found = [
-        (int(match[1]), path)
-        for path in (parent.iterdir() if parent.is_dir() else ())
-        if (match := _STEP_NAME.fullmatch(path.name)) and path.is_dir()
-    ]
-    return sorted(found)
+    folders = [path for path in parent.iterdir() if path.is_dir()] if parent.is_dir() else []
+    matches = [(_STEP_NAME.fullmatch(path.name), path) for path in folders]
+    return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def find_checkpoint(path: Path) -> Path:
@@ -61,11 +58,9 @@ def find_checkpoint(path: Path) -> Path:
             f"checkpoint '{path}' does not exist; give a run folder or a checkpoint folder, "
             f"for example runs/act_current/{CHECKPOINTS}/step_00005000"
         )
-    reason = (
-        "its run has saved none yet"
-        if (path / CHECKPOINTS).is_dir()
-        else f"it has neither {MANIFEST} nor {CHECKPOINTS}/step_*"
-    )
+    reason = f"it has neither {MANIFEST} nor {CHECKPOINTS}/step_*"
+    if (path / CHECKPOINTS).is_dir():
+        reason = "its run has saved none yet"
     raise RequestError(f"'{path}' is no checkpoint: {reason}; give a folder that bin/Train.py made")
 
 
@@ -79,9 +74,8 @@ def checkpoint_folder(folder: Path) -> Iterator[Path]:
     with atomic_folder(folder) as temporary:
         yield temporary
         digests = {path.name: file_digest(path) for path in sorted(temporary.iterdir())}
-        write_json(
-            temporary / MANIFEST, {"schema": SCHEMA, "version": SCHEMA_VERSION, "sha256": digests}
-        )
+        manifest = {"schema": SCHEMA, "version": SCHEMA_VERSION, "sha256": digests}
+        write_json(temporary / MANIFEST, manifest)
         mode = (temporary / MANIFEST).stat().st_mode
         for path in temporary.iterdir():
             path.chmod(mode)  # safetensors gives its files to the owner alone

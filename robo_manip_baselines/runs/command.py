@@ -17,7 +17,8 @@ import select
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn, TypeVar, cast, overload
+from types import UnionType
+from typing import Any, NoReturn, TypeVar, cast
 
 import tyro
 
@@ -97,39 +98,15 @@ def run_command(
     sys.exit(code)
 
 
-@overload
 def parse(
-    options_type: type[Options],
+    options_type: type[Options] | UnionType,
     example: str | None,
     *,
     description: str | None = None,
     args: Sequence[str] | None = None,
     default: Options | None = None,
     prog: str | None = None,
-) -> Options: ...
-
-
-@overload
-def parse(
-    options_type: Any,
-    example: str | None,
-    *,
-    description: str | None = None,
-    args: Sequence[str] | None = None,
-    default: Any = None,
-    prog: str | None = None,
-) -> Any: ...
-
-
-def parse(
-    options_type: Any,
-    example: str | None,
-    *,
-    description: str | None = None,
-    args: Sequence[str] | None = None,
-    default: Any = None,
-    prog: str | None = None,
-) -> Any:
+) -> Options:
     """Read the command line into ``options_type``.
 
     ``--help`` prints every option with its default, and the example. Options are spelt with
@@ -156,7 +133,13 @@ def parse(
     program = sys.argv[0] if prog is None else prog
     result, unknown = _call_tyro(options_type, text, given, default, program)
     if unknown:
-        raise RequestError(_unknown_message(unknown, options_type, text, given, default, program))
+        # the options that --help lists after the known arguments, which may hold a subcommand
+        page = io.StringIO()
+        rest = [arg for arg in given if arg not in unknown]
+        with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit, RequestError):
+            text = text.split("\n\nExample:")[0]
+            _call_tyro(options_type, text, [*rest, "--help"], default, program)
+        raise RequestError(_unknown_message(unknown, page.getvalue(), program))
     return result
 
 
@@ -166,19 +149,15 @@ def _call_tyro(
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
-            return cast(
-                "tuple[Any, list[str]]",
-                tyro.cli(
-                    options_type,
-                    prog=prog,
-                    description=description,
-                    args=args,
-                    **({} if default is None else {"default": default}),
-                    use_underscores=True,
-                    return_unknown_args=True,
-                    config=(tyro.conf.OmitSubcommandPrefixes,),
-                ),
+            given = {} if default is None else {"default": default}
+            found = tyro.cli(
+                options_type,
+                **{"prog": prog, "description": description, "args": args, **given},
+                use_underscores=True,
+                return_unknown_args=True,
+                config=(tyro.conf.OmitSubcommandPrefixes,),
             )
+            return cast("tuple[Any, list[str]]", found)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -194,17 +173,9 @@ def _call_tyro(
         raise RequestError(f"{message}; {_help_hint(prog)}") from None
 
 
-def _unknown_message(
-    unknown: Sequence[str],
-    options_type: Any,
-    description: str,
-    args: Sequence[str],
-    default: Any,
-    prog: str,
-) -> str:
-    known = _known_options(
-        options_type, description, [a for a in args if a not in unknown], default, prog
-    )
+def _unknown_message(unknown: Sequence[str], help_page: str, prog: str) -> str:
+    names = dict.fromkeys(_OPTION.findall(_ANSI.sub("", help_page)))
+    known = [name for name in names if name != "--help"]
     name = next((arg for arg in unknown if arg.startswith("-")), unknown[0])
     if not name.startswith("-"):
         return f"'{name}' is one argument too many; {_help_hint(prog)}"
@@ -212,18 +183,6 @@ def _unknown_message(
     close = difflib.get_close_matches(name.replace("-", "_"), [k.replace("-", "_") for k in known])
     hint = f" (did you mean '--{close[0].lstrip('_')}'?)" if close else ""
     return f"unknown option '{name}'{hint}; valid: {', '.join(known)}; {_help_hint(prog)}"
-
-
-def _known_options(
-    options_type: Any, description: str, args: Sequence[str], default: Any, prog: str
-) -> list[str]:
-    """The options that ``--help`` lists after ``args``, which may hold a subcommand."""
-    page = io.StringIO()
-    with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit, RequestError):
-        text = description.split("\n\nExample:")[0]
-        _call_tyro(options_type, text, [*args, "--help"], default, prog)
-    names = _OPTION.findall(_ANSI.sub("", page.getvalue()))
-    return list(dict.fromkeys(name for name in names if name != "--help"))
 
 
 def _box_to_line(text: str) -> str:

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from typing import Any
 from robo_manip_baselines.runs.errors import RequestError
 
 _TEMPORARY_NAME = re.compile(r"\..+\.(\d+)\.partial")
-_BLOCK = 1 << 20
 
 
 @contextmanager
@@ -173,7 +172,7 @@ def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file, 64 hexadecimal digits."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
+        while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
 
@@ -194,6 +193,23 @@ def _temporary(path: Path) -> Path:
 def _not_writable(folder: Path, error: OSError) -> RequestError:
     reason = error.strerror or error
     return RequestError(f"cannot write to '{folder}': {reason}; choose another folder")
+
+
+def require_out_file(out: Path, load: Callable[[Path], object] | None = None) -> None:
+    """Raise RequestError if ``out`` is a folder, or a file that ``load`` refuses to read."""
+    if out.is_dir():
+        raise RequestError(f"--out {out}: is a folder; name a file")
+    if load is not None and out.exists():
+        try:
+            load(out)
+        except RequestError as error:
+            raise RequestError(f"{error}; it is in the way of --out, so remove it first") from None
+
+
+def require_out_folder(out: Path) -> None:
+    """Raise RequestError if ``out`` is a file."""
+    if out.exists() and not out.is_dir():
+        raise RequestError(f"--out {out}: is a file; name a folder")
 
 
 def _is_alive(process: int) -> bool:

@@ -11,11 +11,10 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol
 
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.files import atomic_file, write_text
 
 LOGGERS = ("tensorboard", "wandb", "none")
 
@@ -32,23 +31,14 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     return lines
 
 
-def truncate_metrics(path: Path, step: int) -> None:
-    """Drop what was written after a step, so that going on from there writes it once."""
-    kept = [line for line in read_metrics(path) if line["step"] <= step]
-    with atomic_file(path) as temporary:
-        temporary.write_text("".join(f"{_to_line(line)}\n" for line in kept), encoding="utf-8")
-
-
 class Board(Protocol):
     """Display of scalars beside the file: TensorBoard or wandb."""
 
     def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
         """Show a number."""
-        ...
 
     def close(self) -> None:
         """Write out what is left."""
-        ...
 
 
 class MetricsLog:
@@ -61,7 +51,9 @@ class MetricsLog:
     """
 
     def __init__(self, path: Path, step: int, board: Board | None) -> None:
-        truncate_metrics(path, step)
+        # lines after the step would be written twice
+        kept = [line for line in read_metrics(path) if line["step"] <= step]
+        write_text(path, "".join(f"{_to_line(line)}\n" for line in kept))
         self._file = path.open("a", encoding="utf-8")
         self._board = board
 
@@ -78,12 +70,7 @@ class MetricsLog:
     def __enter__(self) -> MetricsLog:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -115,9 +102,8 @@ def open_board(logger: str, folder: Path, step: int, config: Mapping[str, Any]) 
             return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
         return _Wandb(folder, config)
     except ImportError as error:
-        raise RequestError(
-            f"{logger} is not installed: pip install {logger}, or say --logger none"
-        ) from error
+        remedy = f"pip install {logger}, or say --logger none"
+        raise RequestError(f"{logger} is not installed: {remedy}") from error
 
 
 class _Wandb:

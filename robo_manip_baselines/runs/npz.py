@@ -52,10 +52,8 @@ def read_npz(path: Path, schema: str, version: int) -> Arrays:
         raise RequestError(f"{path}: schema '{found}', expected '{schema}'")
     found_version = arrays.get("version")
     if found_version is None or found_version.shape != () or int(found_version) != version:
-        raise RequestError(
-            f"{path}: version {found_version} of '{schema}', this program reads {version}; "
-            "make the file again"
-        )
+        wrong = f"version {found_version} of '{schema}', this program reads {version}"
+        raise RequestError(f"{path}: {wrong}; make the file again")
     return arrays
 
 
@@ -72,15 +70,12 @@ def require_array(
     if key not in arrays:
         raise RequestError(f"{path}: key '{key}' is missing; make the file again")
     array = arrays[key]
-    fits = len(array.shape) == len(shape) and all(
-        wanted is None or wanted == got for wanted, got in zip(shape, array.shape, strict=True)
+    fits = array.ndim == len(shape) and all(
+        wanted in (None, got) for wanted, got in zip(shape, array.shape, strict=True)
     )
     if not fits or array.dtype.kind not in kind:
-        wanted_shape = tuple("any" if n is None else n for n in shape)
-        raise RequestError(
-            f"{path}: '{key}' is {array.dtype} {array.shape}, "
-            f"expected kind '{kind}' and shape {wanted_shape}"
-        )
+        expected = f"kind '{kind}' and shape {tuple('any' if n is None else n for n in shape)}"
+        raise RequestError(f"{path}: '{key}' is {array.dtype} {array.shape}, expected {expected}")
     return array
 
 

@@ -6,7 +6,6 @@ import logging
 import sys
 import time
 from collections.abc import Mapping
-from types import TracebackType
 
 from tqdm import tqdm
 
@@ -36,12 +35,9 @@ class StepProgress:
         self.total, self.step = total, done
         self._before, self._start = seconds, time.perf_counter()
         self._shown, self._log_every = shown, log_every
+        disable = None if shown else True  # None: only where there is no terminal
         self._bar = tqdm(
-            total=total,
-            initial=done,
-            unit="step",
-            dynamic_ncols=True,
-            disable=None if shown else True,
+            total=total, initial=done, unit="step", dynamic_ncols=True, disable=disable
         )
 
     @property
@@ -65,21 +61,14 @@ class StepProgress:
         if self._bar.disable and self._shown and self.step % between < self._log_every:
             seconds = self.seconds
             left = seconds / self.step * (self.total - self.step)
-            logger.info(
-                "step %d of %d, loss %.4g, %.0f s, %.0f s left",
-                *(self.step, self.total, loss, seconds, left),
-            )
+            numbers = (self.step, self.total, loss, seconds, left)
+            logger.info("step %d of %d, loss %.4g, %.0f s, %.0f s left", *numbers)
             sys.stderr.flush()
 
     def __enter__(self) -> StepProgress:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.close()
 
 

@@ -43,11 +43,11 @@ def test_the_detector_sees_in_the_pictures_what_the_landmarks_say(dataset, share
         assert set(clips) == set(CLIPS)
         for clip, index in clips.items():
             sequence = data.read(index)
-            assert sequence.pictures.shape == (75, 256, 256, 3)
+            assert sequence.images.shape == (75, 256, 256, 3)
             # where a frame lies between two decoded ones the picture is up to 20 ms off
             frames = np.argsort(np.abs(sequence.image_lag))[:3]
             for frame in frames:
-                (face,) = detector.detect(sequence.pictures[frame], float(frame))
+                (face,) = detector.detect(sequence.images[frame], float(frame))
                 stored = sequence.landmarks[frame, list(LIPS), :2].mean(axis=0)
                 seen = face.landmarks[list(LIPS), :2].mean(axis=0)
                 assert np.abs(stored - seen).max() < 0.015, (clip, frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,21 +11,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage, stats
 
-from face_prediction.evaluation.errors import (
+from face_prediction.evaluation.predictors import (
+    DETECTOR_SIDE,
+    BaselinePredictor,
+    EvaluatedPredictor,
+    FittedPredictor,
+    find_landmarks,
+)
+from face_prediction.evaluation.scoring import (
     LEVELS,
     area_average,
     coverage,
     interval_levels,
     similarities,
 )
-from face_prediction.evaluation.predictors import (
-    DETECTOR_SIDE,
-    BaselinePredictor,
-    DetectedPredictor,
-    find_landmarks,
-)
 from face_prediction.forecast.extrapolation import ConstantVelocity, Persistence
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 from face_prediction.tracking.detector import FaceDetection
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -152,14 +154,14 @@ def test_landmarks_are_where_the_detector_finds_them_in_the_crop() -> None:
 
 
 class Blind:
-    """Forecasts pictures only: the last one, with what is bright moved by eight pixels a frame."""
+    """Forecasts images only: the last one, with what is bright moved by eight pixels a frame."""
 
     name = "blind"
     memory = 1
-    needs = PictureNeeds(1, 64)
+    needs = ImageNeeds(1, 64)
 
-    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
-        moved = [np.roll(pictures[:, -1], 8 * (h + 1), axis=2) for h in range(horizon)]
+    def predict(self, landmarks, images, horizon: int) -> Forecast:
+        moved = [np.roll(images[:, -1], 8 * (h + 1), axis=2) for h in range(horizon)]
         nothing = np.full((len(landmarks), horizon, 468, 2), np.nan, dtype=np.float32)
         return Forecast(nothing, np.stack(moved, axis=1))
 
@@ -167,14 +169,17 @@ class Blind:
 def test_a_predictor_of_pictures_gets_the_detectors_landmarks() -> None:
     shown = np.zeros((1, 1, 64, 64, 3), dtype=np.uint8)
     shown[0, 0, 16:24, 8:16] = 255
-    predictor = DetectedPredictor(Blind(), BrightestPixel([]))
-    assert (predictor.name, predictor.memory, predictor.needs) == ("blind", 1, PictureNeeds(1, 64))
-    forecast = predictor.predict(np.zeros((1, 4, 468, 2)), shown, 3)
+    fitted = {0: FittedPredictor(Blind(), frozenset())}
+    predictor = EvaluatedPredictor("blind", fitted, image_size=64, detector=BrightestPixel([]))
+    assert predictor.needs == [ImageNeeds(1, 64)]
+    history, future = np.zeros((1, 4, 468, 2)), np.zeros((1, 3, 468, 2))
+    batch = SimpleNamespace(history=history, future=future, images=lambda needs: shown)
+    forecast = predictor.forecast([SimpleNamespace(fold=0, subject="ann")], batch)
     np.testing.assert_allclose(
         forecast.landmarks[0, :, 5, 0], (12 + 8 * np.arange(1, 4)) / 64, atol=0.005
     )
-    assert forecast.pictures is not None
-    assert forecast.pictures.shape == (1, 3, 64, 64, 3)
+    assert forecast.images is not None
+    assert forecast.images.shape == (1, 3, 64, 64, 3)
 
 
 def test_a_baseline_copies_the_last_picture_and_forecasts_as_ever() -> None:
@@ -184,11 +189,11 @@ def test_a_baseline_copies_the_last_picture_and_forecasts_as_ever() -> None:
     assert (plain.name, plain.memory, plain.needs.frames) == ("constant_velocity", 2, 0)
     forecast = plain.predict(history, None, 4)
     np.testing.assert_array_equal(forecast.landmarks, ConstantVelocity().predict(history, 4))
-    assert forecast.pictures is None
+    assert forecast.images is None
     copying = BaselinePredictor(Persistence(), 16)
-    assert copying.needs == PictureNeeds(1, 16)
+    assert copying.needs == ImageNeeds(1, 16)
     shown = rng.integers(0, 256, (2, 1, 16, 16, 3), dtype=np.uint8)
-    copied = copying.predict(history, shown, 4).pictures
+    copied = copying.predict(history, shown, 4).images
     assert copied is not None
     assert copied.shape == (2, 4, 16, 16, 3)
     np.testing.assert_array_equal(copied[:, 3], shown[:, 0])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from face_prediction.evaluation.predictors import FittedPredictor, group_networks
 from face_prediction.evaluation.setup import common_folds, shuffled_partners
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -24,9 +24,9 @@ class Network:
 
     name: str
     memory: int | None = 2
-    needs = PictureNeeds(0, 0)
+    needs = ImageNeeds(0, 0)
 
-    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
+    def predict(self, landmarks, images, horizon: int) -> Forecast:
         raise NotImplementedError
 
 

@@ -28,7 +28,7 @@ from face_prediction.evaluation.predictors import (
     cross_fit,
 )
 from face_prediction.motion.library import RecordedMotion, save_motion
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 from face_prediction.tracking.geometry import crop_around
 from face_prediction.tracking.tracks import save_track
 from robo_manip_baselines.runs.errors import RequestError
@@ -91,18 +91,20 @@ class Watched:
     name = "watched"
     memory = None
 
-    def __init__(self, offset=(0.0, 0.0), needs: PictureNeeds | None = None) -> None:
+    def __init__(self, offset=(0.0, 0.0), needs: ImageNeeds | None = None) -> None:
         self.offset = np.array(offset)
-        self.needs = needs or PictureNeeds(0, 0)
+        self.needs = needs or ImageNeeds(0, 0)
         self.shown: list[tuple[np.ndarray, np.ndarray | None]] = []
 
-    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
-        self.shown.append((landmarks, pictures))
+    def predict(self, landmarks, images, horizon: int) -> Forecast:
+        self.shown.append((landmarks, images))
         ahead = np.repeat(landmarks[:, -1:], horizon, axis=1) + self.offset
         return Forecast(ahead.astype(np.float32))
 
 
-def use(monkeypatch, fits: EvaluatedPredictor) -> None:
+def use(monkeypatch, by_fold: dict[int, Watched], trained_on=frozenset()) -> None:
+    fitted = {fold: FittedPredictor(watched, trained_on) for fold, watched in by_fold.items()}
+    fits = EvaluatedPredictor("watched", fitted)
     monkeypatch.setattr(export_stats_command, "cross_fit", lambda *_: fits)
 
 
@@ -179,42 +181,34 @@ def test_each_fold_is_forecast_by_its_own_predictor(options, monkeypatch) -> Non
     with FaceDataset(options.dataset) as dataset:
         fold_of = {clip.subject: clip.fold or 0 for clip in dataset.manifest.clips}
     watched = {fold: Watched((0.1 * fold, 0.0)) for fold in range(3)}
-    fits = EvaluatedPredictor(
-        "watched", {f: FittedPredictor(w, frozenset()) for f, w in watched.items()}
-    )
-    use(monkeypatch, fits)
+    use(monkeypatch, watched)
     assert run_export_stats(options) == 0
     for run in load_predictor_error_stats(options.out).residuals:
         expected = 0.1 * fold_of[run.subject] - 0.015
         assert run.values[0][2][0] == pytest.approx(expected, abs=2e-6)
     for predictor in watched.values():
-        for landmarks, pictures in predictor.shown:
+        for landmarks, images in predictor.shown:
             assert landmarks.shape[1:] == (HISTORY, 468, 2)  # the future is not in it
-            assert pictures is None
+            assert images is None
 
 
 def test_pictures_are_the_last_of_the_history(options, monkeypatch) -> None:
-    watched = Watched(needs=PictureNeeds(3, 32))
-    use(
-        monkeypatch,
-        EvaluatedPredictor(
-            "watched", dict.fromkeys(range(3), FittedPredictor(watched, frozenset()))
-        ),
-    )
+    watched = Watched(needs=ImageNeeds(3, 32))
+    use(monkeypatch, dict.fromkeys(range(3), watched))
     assert run_export_stats(replace(options, kind="head_motion")) == 0
-    ((_, pictures),) = watched.shown
+    ((_, images),) = watched.shown
     with FaceDataset(options.dataset) as dataset:
         (index,) = dataset.indices(kinds={"head_motion"}).tolist()
-        expected = dataset.pictures(index, slice(5, 8), 2)
-    assert pictures is not None
-    np.testing.assert_array_equal(pictures[0], expected)
+        expected = dataset.images(index, slice(5, 8), 2)
+    assert images is not None
+    np.testing.assert_array_equal(images[0], expected)
 
 
 def test_a_fold_without_a_checkpoint_is_left_out(options, monkeypatch) -> None:
     with FaceDataset(options.dataset) as dataset:
         fold_of = {clip.subject: clip.fold or 0 for clip in dataset.manifest.clips}
     fold = fold_of["bob"]
-    use(monkeypatch, EvaluatedPredictor("watched", {fold: FittedPredictor(Watched(), frozenset())}))
+    use(monkeypatch, {fold: Watched()})
     assert run_export_stats(options) == 0
     stats = load_predictor_error_stats(options.out)
     assert [run.subject for run in stats.residuals] == [
@@ -223,8 +217,7 @@ def test_a_fold_without_a_checkpoint_is_left_out(options, monkeypatch) -> None:
 
 
 def test_whoever_was_trained_on_is_not_judged(options, monkeypatch) -> None:
-    fits = {fold: FittedPredictor(Watched(), frozenset({"bob", "dora"})) for fold in range(3)}
-    use(monkeypatch, EvaluatedPredictor("watched", fits))
+    use(monkeypatch, dict.fromkeys(range(3), Watched()), frozenset({"bob", "dora"}))
     with pytest.raises(RequestError, match="trained on subject 'bob'"):
         run_export_stats(options)
     assert not options.out.exists()
@@ -270,13 +263,8 @@ def test_what_cannot_be_done_is_refused(options, change, message: str) -> None:
 
 
 def test_a_picture_size_that_the_dataset_has_not_is_refused(options, monkeypatch) -> None:
-    watched = Watched(needs=PictureNeeds(1, 48))
-    use(
-        monkeypatch,
-        EvaluatedPredictor(
-            "watched", dict.fromkeys(range(3), FittedPredictor(watched, frozenset()))
-        ),
-    )
+    watched = Watched(needs=ImageNeeds(1, 48))
+    use(monkeypatch, dict.fromkeys(range(3), watched))
     with pytest.raises(RequestError, match="images of 48 pixels: this dataset can give 64, 32, "):
         run_export_stats(options)
 
@@ -291,10 +279,10 @@ def test_other_files_are_not_overwritten(options, tmp_path: Path) -> None:
 
 
 def test_pictures_at_once_fit_in_memory() -> None:
-    assert batch_size(PictureNeeds(0, 0)) == 64
-    assert batch_size(PictureNeeds(70, 256)) == 4
-    assert batch_size(PictureNeeds(1, 16)) == 64
-    assert batch_size(PictureNeeds(1000, 256)) == 1
+    assert batch_size(ImageNeeds(0, 0)) == 64
+    assert batch_size(ImageNeeds(70, 256)) == 4
+    assert batch_size(ImageNeeds(1, 16)) == 64
+    assert batch_size(ImageNeeds(1000, 256)) == 1
 
 
 def predicted_library(tmp_path: Path) -> Path:

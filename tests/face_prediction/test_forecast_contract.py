@@ -86,8 +86,7 @@ def test_when_it_happens_does_not_matter(forecaster: Forecaster, sequences: np.n
     # the same frames at another place of a longer sequence: only frames, not their index, count
     later = np.concatenate([sequences[:, 50:], sequences[:, :40], sequences[:, 40:45]], axis=1)
     np.testing.assert_array_equal(
-        forecaster.predict(later[:, 10:50], HORIZON),
-        forecaster.predict(sequences[:, :40], HORIZON),
+        forecaster.predict(later[:, 10:50], HORIZON), forecaster.predict(sequences[:, :40], HORIZON)
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.histories import dataset_image
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.forecast.extrapolation import ConstantVelocity
 from face_prediction.live.streaming import (
@@ -17,7 +17,7 @@ from face_prediction.live.streaming import (
     NetworkForecaster,
     StreamingPredictor,
 )
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 from face_prediction.tracking.geometry import Crop, crop_around
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -36,8 +36,7 @@ def toy(history: int = 8, pictures: int = 5, span: int = 1, landmarks: bool = Tr
         def __init__(self) -> None:
             super().__init__()
             self.history, self.horizon, self.span = history, 5, span
-            self.needs = PictureNeeds(pictures, 32)
-            self.makes_images = False
+            self.needs = ImageNeeds(pictures, 32)
             self.weight = torch.nn.Parameter(torch.tensor(1e-7, dtype=torch.float64))
             self.encoded: list[int] = []
 
@@ -90,7 +89,7 @@ def batch(model, landmarks, images, now: int, crop: Crop) -> np.ndarray:
 
     rows = np.maximum(np.arange(now - SETTINGS.history + 1, now + 1), 0)
     seen = crop.normalise(landmarks[rows], SIZE)[..., :2].astype(np.float32)
-    shown = [dataset_picture(images[i], crop, SETTINGS, 32) for i in rows[-model.needs.frames :]]
+    shown = [dataset_image(images[i], crop, SETTINGS, 32) for i in rows[-model.needs.frames :]]
     with torch.inference_mode():
         output = model(
             History(torch.tensor(seen)[None, -model.history :], torch.tensor(np.stack(shown))[None])
@@ -217,10 +216,10 @@ class Still:
 
     name = "still"
     memory = None
-    needs = PictureNeeds(0, 0)
+    needs = ImageNeeds(0, 0)
 
-    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
-        assert pictures is None
+    def predict(self, landmarks, images, horizon: int) -> Forecast:
+        assert images is None
         return Forecast(np.repeat(landmarks[:, -1:], horizon, axis=1))
 
 
@@ -243,9 +242,9 @@ def test_a_camera_at_another_rate_is_brought_to_thirty(make_track) -> None:
     shown: list[np.ndarray] = []
 
     class Watching(Still):
-        def predict(self, landmarks, pictures, horizon: int) -> Forecast:
+        def predict(self, landmarks, images, horizon: int) -> Forecast:
             shown.append(landmarks[0])
-            return super().predict(landmarks, pictures, horizon)
+            return super().predict(landmarks, images, horizon)
 
     image = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8)
     for rate in (25.0, 60.0):

@@ -98,7 +98,7 @@ def test_what_comes_out(name: str) -> None:
         assert output.landmarks is None
     else:
         assert output.landmarks.shape == (2, 3, 468, 2)
-    assert (model.history, model.horizon, model.span, model.makes_images) == (6, 3, 1, True)
+    assert (model.history, model.horizon, model.span) == (6, 3, 1)
     assert (model.needs.frames, model.needs.size) == (6, 32)
 
 

@@ -19,7 +19,7 @@ from face_prediction.dataset.sequences import clip_frames
 from face_prediction.evaluation.predictors import EvaluatedPredictor, FittedPredictor
 from face_prediction.forecast import mouth_centre
 from face_prediction.motion.library import load_motion, save_motion
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import FaceTrack, load_track, save_track
 from robo_manip_baselines.runs.errors import RequestError
@@ -112,18 +112,18 @@ def folder(made: Path, tmp_path: Path) -> Folder:
 
 
 class DotFollower:
-    """Reads where the red dot is in the last two pictures, and lets the face go on like it."""
+    """Reads where the red dot is in the last two images, and lets the face go on like it."""
 
     name = "dot"
     memory = None
-    needs = PictureNeeds(7, 64)
+    needs = ImageNeeds(7, 64)
 
-    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
-        red = np.clip(pictures[..., 0].astype(float) - pictures[..., 1] - 40, 0, None)
+    def predict(self, landmarks, images, horizon: int) -> Forecast:
+        red = np.clip(images[..., 0].astype(float) - images[..., 1] - 40, 0, None)
         grid = (np.arange(64) + 0.5) / 64
         total = red.sum(axis=(2, 3))
         dot = np.stack([red.sum(2) @ grid, red.sum(3) @ grid], axis=-1) / total[..., None]
-        step = (dot[:, -1] - dot[:, 0]) / (dot.shape[1] - 1)  # six frames are five pictures apart
+        step = (dot[:, -1] - dot[:, 0]) / (dot.shape[1] - 1)  # six frames are five images apart
         ahead = dot[:, -1:] + step[:, None] * np.arange(1, horizon + 1)[:, None]
         moved = ahead - mouth_centre(landmarks[:, -1:])
         return Forecast((landmarks[:, -1:] + moved[:, :, None]).astype(np.float32))
@@ -235,11 +235,11 @@ def test_histories_are_those_of_the_dataset(folder: Folder) -> None:
             track,
             frames.source_frame,
             origins,
-            PictureNeeds(HISTORY, 32),
+            ImageNeeds(HISTORY, 32),
             settings,
         )
-        for index, origin, pictures in zip(indices, origins, seen, strict=True):
-            np.testing.assert_array_equal(pictures, dataset.pictures(index, slice(HISTORY), 2))
+        for index, origin, images in zip(indices, origins, seen, strict=True):
+            np.testing.assert_array_equal(images, dataset.images(index, slice(HISTORY), 2))
             points = origin.crop.normalise(frames.landmarks[origin.history], SIZE)
             np.testing.assert_array_equal(
                 points.astype(np.float32), dataset.landmarks(index)[:HISTORY]
@@ -324,9 +324,9 @@ def test_a_track_at_another_rate_is_refused(folder: Folder, make_track) -> None:
 
 def test_a_predictor_without_a_forecast_is_refused(folder: Folder, monkeypatch) -> None:
     class Blind(DotFollower):
-        needs = PictureNeeds(0, 0)
+        needs = ImageNeeds(0, 0)
 
-        def predict(self, landmarks, pictures, horizon: int) -> Forecast:
+        def predict(self, landmarks, images, horizon: int) -> Forecast:
             return Forecast(np.full((len(landmarks), horizon, 468, 2), np.nan, dtype=np.float32))
 
     use(monkeypatch, Blind())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.live import load_forecaster
-from face_prediction.dataset.histories import dataset_picture
+from face_prediction.dataset.histories import dataset_image
 from face_prediction.dataset.manifest import ClipEntry, Manifest, write_manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings
@@ -45,7 +45,7 @@ def dataset(tmp_path: Path) -> Path:
 @pytest.fixture
 def trained(tmp_path: Path, dataset: Path) -> Callable[..., Path]:
     """A folder as ``train`` leaves it, of a tiny network with random weights."""
-    from face_prediction.models.checkpoint import CheckpointRecord, save_predictor_checkpoint
+    from face_prediction.models.learned import CheckpointRecord, save_predictor_checkpoint
     from face_prediction.models.settings import make_predictor_model, settings_class
 
     def save(fold: int, model: str = "cross_attention", name: str = "", **changes: Any) -> Path:
@@ -128,7 +128,7 @@ def test_live_says_what_the_network_says_of_the_whole_history(trained, make_trac
         crop = forecast.crop
         rows = np.maximum(np.arange(now - 7, now + 1), 0)
         seen = crop.normalise(landmarks[rows], SIZE)[None, ..., :2].astype(np.float32)
-        shown = np.stack([dataset_picture(images[i], crop, SETTINGS, 32) for i in rows])[None]
+        shown = np.stack([dataset_image(images[i], crop, SETTINGS, 32) for i in rows])[None]
         expected = predictor.predict(seen, shown, 5).landmarks[0]
         got = (forecast.landmarks * SIZE - [crop.left, crop.top]) / crop.side
         # one picture at a time and eight together add up in another order

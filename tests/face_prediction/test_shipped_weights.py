@@ -55,7 +55,7 @@ def test_it_forecasts_swaying_heads_better_than_copying(shipped: LearnedPredicto
     ours = np.abs(mouth_centre(forecast.landmarks) - truth).mean(axis=(0, 2))
     theirs = np.abs(still - truth).mean(axis=(0, 2))
     assert np.all(ours < 0.5 * theirs)
-    assert forecast.pictures is not None
+    assert forecast.images is not None
     assert forecast.mouth_scale is not None
     # a promised scale is of the size of the errors that are made
     assert 0.2 < float(forecast.mouth_scale.mean() / ours.mean()) < 5.0

@@ -20,7 +20,7 @@ from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History, Losses, Output, PredictorModel
 from face_prediction.models.residual.prior import AdaptivePrior, PriorForecast
 from face_prediction.models.settings import ResidualSettings
-from face_prediction.prediction.interface import PictureNeeds
+from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
@@ -46,20 +46,16 @@ _LEAST_FREEDOM = 2.0
 _FREEDOM_START = math.log(math.expm1(3.0))
 
 # Warp
-FLOW_CELLS = 32
-"""G, fine enough for a jaw."""
-FLOW_REACH = 0.05
-"""Standard deviation in crops of the Gaussian with which landmarks move the cells around them."""
-BACKGROUND = 0.3
-"""Weight of the background, which stays, beside the landmarks'."""
+FLOW_CELLS = 32  # G, fine enough for a jaw
+FLOW_REACH = 0.05  # crops, standard deviation of the Gaussian that moves cells around landmarks
+BACKGROUND = 0.3  # weight of the background, which stays, beside the landmarks'
 
 # Training
+# Frames between the origins of a sequence that are trained on. The last is at its end; the first
+# has as many frames before it as the network sees.
 ORIGIN_STEP = 3
-"""Frames between the origins of a sequence that are trained on. The last is at its end; the first
-has as many frames before it as the network sees."""
-_USUAL_ERROR = (
-    0.01  # crops, counts 1 in the loss: the best baselines' (docs/predictor_evaluation.md)
-)
+# crops, counts 1 in the loss: the best baselines' (docs/predictor_evaluation.md)
+_USUAL_ERROR = 0.01
 
 
 def cut_out(images: Tensor, landmarks: Tensor, side: int) -> Tensor:
@@ -68,14 +64,14 @@ def cut_out(images: Tensor, landmarks: Tensor, side: int) -> Tensor:
     Args:
         images: (B, N, 3, S, S), floating.
         landmarks: (B, N, L, 2), where the face is.
-        side: C.
+        side: C, pixels.
     """
     span = landmarks.amax(dim=2) - landmarks.amin(dim=2)  # (B, N, 2)
     height = span[..., 1].clamp_min(1e-3)
     cells = (torch.arange(side, device=images.device) + 0.5) / side - 0.5
     offsets = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1)  # (C, C, 2)
     flat = images.flatten(0, 1)
-    regions: list[Tensor] = []
+    regions = []
     for points, share in REGIONS:
         middle = landmarks[:, :, points].mean(dim=2)
         size = (share * height)[..., None, None, None]
@@ -87,12 +83,9 @@ def cut_out(images: Tensor, landmarks: Tensor, side: int) -> Tensor:
 
 
 class RegionEncoder(nn.Module):
-    """A token for every region of every frame, from the region and its change since the last.
+    """A token (D) for every region (C x C) of every frame, from it and its change since the last.
 
-    Args:
-        side: C.
-        channels: of the convolutions, each of which halves the region.
-        width: D.
+    Each of the convolutions halves the region.
     """
 
     def __init__(self, side: int, channels: tuple[int, ...], width: int) -> None:
@@ -122,13 +115,8 @@ class RegionEncoder(nn.Module):
 class CorrectionNet(nn.Module):
     """Recurrent network over the motion, attention to the images' tokens, linear heads.
 
-    The last layers begin at zero: an untrained network is the prior.
-
-    Args:
-        horizon: H.
-        shapes: K.
-        width: D.
-        dropout: on the inputs of the layers.
+    The last layers begin at zero: an untrained network is the prior. Dropout is on the inputs of
+    the layers.
     """
 
     def __init__(self, horizon: int, shapes: int, width: int, dropout: float) -> None:
@@ -137,10 +125,7 @@ class CorrectionNet(nn.Module):
         self.inputs = nn.Linear(2 * (2 + shapes) + 1, width)
         self.motion = nn.GRU(width, width, batch_first=True)
         self.dropout = nn.Dropout(dropout)
-        self.query = nn.Linear(width, width)
-        self.key = nn.Linear(width, width)
-        self.value = nn.Linear(width, width)
-        self.seen = nn.Linear(width, width)
+        self.query, self.key, self.value, self.seen = (nn.Linear(width, width) for _ in range(4))
         self.hidden = nn.Linear(width + 4 * horizon, width)
         self.change = nn.Linear(width, horizon * (2 + shapes))
         self.log_scale = nn.Linear(width, 2 * horizon)
@@ -199,8 +184,7 @@ def _motion(mouth: Tensor, shapes: Tensor) -> tuple[Tensor, Tensor]:
     Steps, and places seen from the newest frame, each divided by the root mean square of the
     steps; and how jerky a frame was beside the others, which shows repeated frames.
     """
-    parts: list[Tensor] = []
-    paces: list[Tensor] = []
+    parts, paces = [], []
     for series in (mouth, shapes):
         steps = torch.diff(series, dim=2, prepend=series[:, :, :1])
         pace = steps.square().mean(dim=(2, 3), keepdim=True).sqrt() + _LEAST_STEP
@@ -233,19 +217,14 @@ def flow(landmarks: Tensor, forecast: Tensor) -> Tensor:
 
 
 def warp(image: Tensor, moved: Tensor) -> Tensor:
-    """Move the content of an image by a flow, bilinearly.
+    """Move the content of an image by a flow, bilinearly; return images (B, H, 3, S, S).
 
     Args:
         image: (B, 3, S, S).
         moved: (B, H, 2, G, G) from `flow`.
-
-    Returns:
-        Images (B, H, 3, S, S).
     """
     side, horizon = image.shape[-1], moved.shape[1]
-    fine = functional.interpolate(
-        moved.flatten(0, 1), size=(side, side), mode="bilinear", align_corners=False
-    )
+    fine = functional.interpolate(moved.flatten(0, 1), (side, side), mode="bilinear")
     pixels = (torch.arange(side, device=image.device) + 0.5) / side
     place = torch.stack(torch.meshgrid(pixels, pixels, indexing="xy"), dim=-1)  # (S, S, 2)
     grid = 2 * (place - fine.permute(0, 2, 3, 1)) - 1
@@ -257,11 +236,7 @@ def warp(image: Tensor, moved: Tensor) -> Tensor:
 
 
 class Refiner(nn.Module):
-    """Corrects warped images at half their size; begins by changing nothing.
-
-    Args:
-        channels: of the convolutions.
-    """
+    """Corrects warped images at half their size; begins by changing nothing."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -281,10 +256,9 @@ class Refiner(nn.Module):
         return (warped + refined.unflatten(0, (-1, horizon))).clamp(0, 1)
 
 
-def _begin_at_zero(*layers: nn.Module) -> None:
-    for layer in layers:
-        for parameter in layer.parameters():
-            nn.init.zeros_(parameter)
+def _begin_at_zero(*layers: nn.Linear | nn.Conv2d) -> None:
+    for parameter in nn.ModuleList(layers).parameters():
+        nn.init.zeros_(parameter)
 
 
 class ResidualModel(PredictorModel):
@@ -293,11 +267,8 @@ class ResidualModel(PredictorModel):
     def __init__(self, settings: ResidualSettings) -> None:
         super().__init__()
         self.settings = settings
-        self.history = settings.history
-        self.horizon = settings.horizon
-        self.needs = PictureNeeds(settings.pictures, settings.size)
-        self.span = 2
-        self.makes_images = True
+        self.history, self.horizon, self.span = settings.history, settings.horizon, 2
+        self.needs = ImageNeeds(settings.pictures, settings.size)
         self.prior = AdaptivePrior(settings.horizon, settings.shapes)
         self.regions = RegionEncoder(settings.region, settings.channels, settings.width)
         self.correction = CorrectionNet(
@@ -346,12 +317,9 @@ class ResidualModel(PredictorModel):
             "landmarks": (forecast - truth).abs().mean() / _USUAL_ERROR,
             "pictures": functional.l1_loss(images, target),
         }
-        total = (
-            terms["likelihood"]
-            + s.mouth_weight * terms["mouth"]
-            + s.landmark_weight * terms["landmarks"]
-            + s.picture_weight * terms["pictures"]
-        )
+        total = terms["likelihood"] + s.mouth_weight * terms["mouth"]
+        total = total + s.landmark_weight * terms["landmarks"]
+        total = total + s.picture_weight * terms["pictures"]
         return Losses(total, {name: value.detach() for name, value in terms.items()})
 
     def _landmarks(

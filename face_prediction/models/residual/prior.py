@@ -35,17 +35,14 @@ _WARM_UP = 16  # frames at the beginning of a sequence that are left out: they h
 _STILL = 1e-3  # crops: a sequence with this mean step of the mouth counts half
 
 # Adaptation to one face
-PERIOD = 6
-"""Frames of 30 a second after which the pattern of video of 25 repeats."""
-OTHER_PHASES = 0.1
-"""Weight of frames at another phase of the pattern, for a periodic expert."""
+PERIOD = 6  # frames of 30 a second after which the pattern of video of 25 repeats
+OTHER_PHASES = 0.1  # weight of frames at another phase of the pattern, for a periodic expert
 _REST = 1e-6  # least mean square of scaled features: a face at rest must not divide by 0
 
 # Mixture
-WINDOW = 40
-"""Origins whose errors decide an expert's weight."""
+WINDOW = 40  # origins whose errors decide an expert's weight
+# an expert whose errors are 1 + d times the best one's has exp(-SHARPNESS d) times its weight
 SHARPNESS = 15.0
-"""An expert whose errors are 1 + d times the best one's has exp(-SHARPNESS d) times its weight."""
 _WINDOW_OTHER_PHASES = 0.2  # weight of origins at another phase of the pattern
 _ALIKE = 1e-5  # crops, added to errors before they are compared: a hundredth of a pixel of 256
 _LEAST_ERROR = 2e-4  # crops: below the detector's jitter (0.0004 and more)
@@ -65,14 +62,9 @@ class Block:
     components: int
     lags: int
 
-    @property
-    def size(self) -> int:
-        """F, number of features."""
-        return self.components * self.lags
-
 
 @dataclass(frozen=True)
-class Expert:
+class LinearExpert:
     """A forecaster on a block of features.
 
     Attributes:
@@ -87,22 +79,17 @@ class Expert:
     periodic: bool = False
 
 
-BLOCKS = (
-    Block("shapes", 8, 3),
-    Block("shapes", 4, 6),
-    Block("shapes", 4, 2),
-    Block("mouth", 2, 4),
-)
+BLOCKS = (Block("shapes", 8, 3), Block("shapes", 4, 6), Block("shapes", 4, 2), Block("mouth", 2, 4))
 EXPERTS = (
-    Expert(0, None),
-    Expert(0, 10.0),
-    Expert(1, 3.0),
-    Expert(1, 3.0, periodic=True),
-    Expert(2, None),
-    Expert(2, 1.0),
-    Expert(2, 1.0, periodic=True),
-    Expert(3, 3.0),
-    Expert(3, 1.0, periodic=True),
+    LinearExpert(0, None),
+    LinearExpert(0, 10.0),
+    LinearExpert(1, 3.0),
+    LinearExpert(1, 3.0, periodic=True),
+    LinearExpert(2, None),
+    LinearExpert(2, 1.0),
+    LinearExpert(2, 1.0, periodic=True),
+    LinearExpert(3, 3.0),
+    LinearExpert(3, 1.0, periodic=True),
 )
 """Chosen on folds of the development clips among 54; see docs/predictors.md. The expert that
 expects no motion at all needs no line here."""
@@ -170,7 +157,7 @@ def adapted(x: Tensor, error: Tensor, now: Tensor, weight: Tensor, shrink: float
         error: (B, N, R) outcomes less the people's forecast.
         now: (B, O, F) features to forecast from.
         weight: (O, N) of the rows, 0 where their outcomes are not known yet.
-        shrink: see `Expert`.
+        shrink: see `LinearExpert`.
     """
     batch, rows, size = x.shape
     products = (x[..., :, None] * x[..., None, :]).reshape(batch, rows, size * size)
@@ -209,15 +196,17 @@ class AdaptivePrior(nn.Module):
     basis: Tensor
     step: Tensor
 
-    def __init__(self, horizon: int, shapes: int, experts: tuple[Expert, ...] = EXPERTS) -> None:
+    def __init__(
+        self, horizon: int, shapes: int, experts: tuple[LinearExpert, ...] = EXPERTS
+    ) -> None:
         super().__init__()
-        self.horizon = horizon
-        self.experts = experts
+        self.horizon, self.experts = horizon, experts
         self.register_buffer("basis", torch.zeros(shapes, 2 * NUM_LANDMARKS))
         self.register_buffer("step", torch.ones(shapes))
         for i, block in enumerate(BLOCKS):
-            self.register_buffer(f"scale_{i}", torch.ones(block.size))
-            self.register_buffer(f"people_{i}", torch.zeros(block.size, horizon * (2 + shapes)))
+            size = block.components * block.lags  # F
+            self.register_buffer(f"scale_{i}", torch.ones(size))
+            self.register_buffer(f"people_{i}", torch.zeros(size, horizon * (2 + shapes)))
 
     def fit(self, sequences: LandmarkSequences) -> None:
         """Fit shapes, scales and the people's coefficients."""
@@ -231,7 +220,7 @@ class AdaptivePrior(nn.Module):
         weight = np.repeat(pace / (pace + _STILL), y.shape[1])
         for i, block in enumerate(BLOCKS):
             x = features(block, mouth, shapes)[:, _WARM_UP : _WARM_UP + y.shape[1]]
-            rows = x.double().cpu().numpy().reshape(-1, block.size)
+            rows = x.double().cpu().numpy().reshape(-1, x.shape[-1])
             scale = rows.std(axis=0) + 1e-9
             people = fit_people(rows / scale, y.reshape(len(rows), -1), weight, self.horizon)
             self.get_buffer(f"scale_{i}").copy_(torch.from_numpy(scale))
@@ -274,7 +263,7 @@ class AdaptivePrior(nn.Module):
     def _experts(self, mouth: Tensor, shapes: Tensor, known: Tensor | None) -> Tensor:
         """Return the forecasts (B, E, T, R) of every expert at every origin."""
         rows = torch.arange(mouth.shape[1], device=mouth.device)
-        people: list[tuple[Tensor, Tensor]] = []
+        people = []
         for i, block in enumerate(BLOCKS):
             x = features(block, mouth, shapes) / self.get_buffer(f"scale_{i}")
             people.append((x, x @ self.get_buffer(f"people_{i}")))

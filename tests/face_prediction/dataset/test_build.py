@@ -47,14 +47,14 @@ def test_the_whole_way(folder, capsys) -> None:
         }  # fmt: skip
         for index in (0, 7, 17):
             sequence = dataset.read(index)
-            assert sequence.pictures.shape == (10, 64, 64, 3)
-            assert sequence.pictures.dtype == np.uint8
+            assert sequence.images.shape == (10, 64, 64, 3)
+            assert sequence.images.dtype == np.uint8
             assert sequence.landmarks.shape == (10, 468, 3)
             assert sequence.landmarks.dtype == np.float32
             np.testing.assert_array_equal(sequence.landmarks, dataset.landmarks(index))
             # the picture shows the mouth where the landmarks say it is, in every frame
             red = np.clip(
-                sequence.pictures[..., 0].astype(float) - sequence.pictures[..., 1] - 30, 0, None
+                sequence.images[..., 0].astype(float) - sequence.images[..., 1] - 30, 0, None
             )
             grid = np.arange(64) + 0.5
             total = red.sum(axis=(1, 2))
@@ -112,23 +112,23 @@ def test_a_second_run_makes_nothing_and_a_third_only_what_is_missing(folder, cap
 def test_only_some_frames_and_smaller_pictures(folder) -> None:
     assert folder.run() == 0
     dataset = FaceDataset(folder.root / "dataset")
-    whole = dataset.pictures(3)
-    np.testing.assert_array_equal(dataset.pictures(3, slice(8, None)), whole[8:])
-    np.testing.assert_array_equal(dataset.pictures(3, slice(4, 5)), whole[4:5])
-    half = dataset.pictures(3, reduce=2)
+    whole = dataset.images(3)
+    np.testing.assert_array_equal(dataset.images(3, slice(8, None)), whole[8:])
+    np.testing.assert_array_equal(dataset.images(3, slice(4, 5)), whole[4:5])
+    half = dataset.images(3, reduce=2)
     assert half.shape == (10, 32, 32, 3)
     mean = whole.reshape(10, 32, 2, 32, 2, 3).mean(axis=(2, 4))
     assert np.abs(half - mean).mean() < 4.0
     with pytest.raises(ValueError, match="reduce 3: one of 1, 2, 4, 8"):
-        dataset.pictures(3, reduce=3)
+        dataset.images(3, reduce=3)
     for index in (-1, 18):
         with pytest.raises(IndexError, match="has 18"):
-            dataset.pictures(index)
+            dataset.images(index)
     again = pickle.loads(pickle.dumps(dataset))  # as a worker process is given it
-    np.testing.assert_array_equal(again.pictures(3), whole)
+    np.testing.assert_array_equal(again.images(3), whole)
     again.close()
     dataset.close()
-    np.testing.assert_array_equal(dataset.pictures(3), whole)  # opened again
+    np.testing.assert_array_equal(dataset.images(3), whole)  # opened again
     dataset.close()
 
 

@@ -95,7 +95,7 @@ def test_no_changed_byte_of_a_picture_goes_unseen(folder) -> None:
         dataset.read(first)
     path.write_bytes(content)
     with FaceDataset(folder.root / "dataset") as dataset:
-        np.testing.assert_array_equal(dataset.read(first).pictures, whole.pictures)
+        np.testing.assert_array_equal(dataset.read(first).images, whole.images)
 
 
 def test_pictures_have_checksums_of_their_own(folder) -> None:
@@ -109,4 +109,4 @@ def test_pictures_have_checksums_of_their_own(folder) -> None:
         FaceDataset(folder.root / "dataset") as dataset,
         pytest.raises(RequestError, match=r"one\.h5: image 0: damaged \(its checksum is wrong"),
     ):
-        dataset.pictures(6)
+        dataset.images(6)

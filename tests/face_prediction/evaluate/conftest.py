@@ -16,7 +16,7 @@ from face_prediction.commands.evaluate import EvaluateOptions, run_evaluate
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation.predictors import FittedPredictor
 from face_prediction.forecast.interface import mouth_centre
-from face_prediction.prediction.interface import Forecast, PictureNeeds
+from face_prediction.prediction.interface import Forecast, ImageNeeds
 from face_prediction.tracking.detector import FaceDetection
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import FaceTrack, save_track
@@ -67,9 +67,9 @@ def dataset(make_track, write_video, tmp_path_factory) -> Path:
     return root / "dataset"
 
 
-def red_dots(pictures: np.ndarray) -> np.ndarray:
-    """Where (..., 2) the dot is in pictures (..., S, S, 3)."""
-    red = np.clip(pictures[..., 0].astype(float) - pictures[..., 1] - 60, 0, None)
+def red_dots(images: np.ndarray) -> np.ndarray:
+    """Where (..., 2) the dot is in images (..., S, S, 3)."""
+    red = np.clip(images[..., 0].astype(float) - images[..., 1] - 60, 0, None)
     grid = (np.arange(red.shape[-1]) + 0.5) / red.shape[-1]
     total = red.sum(axis=(-1, -2))
     return np.stack([red.sum(-2) @ grid, red.sum(-1) @ grid], axis=-1) / total[..., None]
@@ -88,17 +88,17 @@ class Toy:
     memory: int | None = 1
 
     @property
-    def needs(self) -> PictureNeeds:
-        return PictureNeeds(2, self.size)
+    def needs(self) -> ImageNeeds:
+        return ImageNeeds(2, self.size)
 
-    def predict(self, landmarks, pictures, horizon: int) -> Forecast:
+    def predict(self, landmarks, images, horizon: int) -> Forecast:
         last = landmarks[:, -1:]
-        shift = red_dots(pictures[:, -1:]) - mouth_centre(last) if self.reads else np.zeros((1, 2))
+        shift = red_dots(images[:, -1:]) - mouth_centre(last) if self.reads else np.zeros((1, 2))
         ahead = (last + np.reshape(shift, (-1, 1, 1, 2))).repeat(horizon, axis=1)
         if self.name == "blind":
             ahead = np.full_like(ahead, np.nan)
         scale = np.full((len(last), horizon, 2), 0.05, dtype=np.float32)
-        copies = pictures[:, -1:].repeat(horizon, axis=1)
+        copies = images[:, -1:].repeat(horizon, axis=1)
         freedom = np.full((horizon, 2), 4.0)
         if self.name == "careless":
             return Forecast(ahead.astype(np.float32))

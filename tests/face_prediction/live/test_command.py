@@ -13,7 +13,7 @@ import pytest
 
 from face_prediction.commands import live as live_command
 from face_prediction.commands.live import LiveOptions, run_live
-from face_prediction.live import display
+from face_prediction.live import loop as display
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 

@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from face_prediction.live.display import FAR, GREEN, NEAR, draw_mouth, draw_text
-from face_prediction.live.loop import LiveStatistics, captions, run_loop
+from face_prediction.live.loop import (
+    FAR,
+    GREEN,
+    NEAR,
+    LiveStatistics,
+    captions,
+    draw_mouth,
+    draw_text,
+    run_loop,
+)
 from face_prediction.live.streaming import LiveForecast
 from face_prediction.tracking.geometry import Crop
 from face_prediction.tracking.video import VideoFrame

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from face_prediction.live import sources
-from face_prediction.live.display import video_sink, window_sink
+from face_prediction.live.loop import video_sink, window_sink
 from face_prediction.live.sources import camera_frames, live_frames
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError

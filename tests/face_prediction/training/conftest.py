@@ -24,7 +24,6 @@ from face_prediction.dataset.sequences import (
     sequence_statistics,
 )
 from face_prediction.tracking.geometry import LIPS
-from face_prediction.training import setup as job
 from face_prediction.training import trainer as trainer_module
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import WindowBatch
@@ -137,7 +136,7 @@ def trained(finished: FaceTrainOptions) -> Path:
 @pytest.fixture
 def no_curves(monkeypatch) -> None:
     """Drawing takes longer than these trainings."""
-    monkeypatch.setattr(job, "write_curves", lambda *arguments: None)
+    monkeypatch.setattr(trainer_module, "write_curves", lambda *arguments: None)
 
 
 @pytest.fixture

@@ -13,9 +13,8 @@ import pytest
 import torch
 
 from face_prediction.commands.train import run_train
-from face_prediction.models.checkpoint import read_tensors, write_tensors
 from face_prediction.models.interface import History
-from face_prediction.models.learned import LearnedPredictor
+from face_prediction.models.learned import LearnedPredictor, read_tensors, write_tensors
 from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
@@ -24,8 +23,8 @@ pytestmark = pytest.mark.long
 class TestLearnedPredictor:
     def inputs(self, rows: int = 5) -> tuple[np.ndarray, np.ndarray]:
         rng = np.random.default_rng(0)
-        pictures = rng.integers(0, 256, (rows, 6, 32, 32, 3), dtype=np.uint8)
-        return rng.uniform(0, 1, (rows, 8, 468, 2)), pictures
+        images = rng.integers(0, 256, (rows, 6, 32, 32, 3), dtype=np.uint8)
+        return rng.uniform(0, 1, (rows, 8, 468, 2)), images
 
     def test_what_it_says_of_itself(self, trained: Path) -> None:
         predictor = LearnedPredictor.load(trained)
@@ -35,28 +34,28 @@ class TestLearnedPredictor:
         assert predictor.record.train_subjects == ["dan", "eve"]
 
     def test_batches_and_horizons(self, trained: Path) -> None:
-        landmarks, pictures = self.inputs()
-        whole = LearnedPredictor.load(trained).predict(landmarks, pictures, 2)
+        landmarks, images = self.inputs()
+        whole = LearnedPredictor.load(trained).predict(landmarks, images, 2)
         assert whole.landmarks.shape == (5, 2, 468, 2)
         assert whole.landmarks.dtype == np.float32
-        assert whole.pictures is not None
-        assert whole.pictures.shape == (5, 2, 32, 32, 3)
-        assert whole.pictures.dtype == np.uint8
+        assert whole.images is not None
+        assert whole.images.shape == (5, 2, 32, 32, 3)
+        assert whole.images.dtype == np.uint8
         assert whole.mouth_scale is None
-        parts = LearnedPredictor.load(trained, batch_size=2).predict(landmarks, pictures, 2)
+        parts = LearnedPredictor.load(trained, batch_size=2).predict(landmarks, images, 2)
         np.testing.assert_allclose(parts.landmarks, whole.landmarks, atol=1e-6)
-        assert np.abs(parts.pictures.astype(int) - whole.pictures).max() <= 1  # pyright: ignore
-        one = LearnedPredictor.load(trained).predict(landmarks[:, 2:], pictures, 1)
+        assert np.abs(parts.images.astype(int) - whole.images).max() <= 1  # pyright: ignore
+        one = LearnedPredictor.load(trained).predict(landmarks[:, 2:], images, 1)
         np.testing.assert_allclose(one.landmarks, whole.landmarks[:, :1], atol=1e-6)
 
     def test_pictures_come_out_as_they_went_in(self, trained: Path) -> None:
         """Colours and rows in their places: the network's output against the array's."""
         predictor = LearnedPredictor.load(trained)
-        landmarks, pictures = self.inputs(1)
-        got = predictor.predict(landmarks, pictures, 2).pictures
+        landmarks, images = self.inputs(1)
+        got = predictor.predict(landmarks, images, 2).images
         with torch.no_grad():
             history = History(
-                torch.tensor(landmarks[:, 2:], dtype=torch.float32), torch.tensor(pictures)
+                torch.tensor(landmarks[:, 2:], dtype=torch.float32), torch.tensor(images)
             )
             out = predictor.model(history).images.numpy()
         expected = out.transpose(0, 1, 3, 4, 2) * 255
@@ -71,7 +70,7 @@ class TestLearnedPredictor:
             (lambda x, p: (x[:, :5], p, 1), "a history of 5 frames; cross_attention needs 6"),
             (lambda x, p: (x[..., :1], p, 1), "expected .histories, frames, 468, 2"),
             (lambda x, p: (x[0], p, 1), "landmarks of shape"),
-            (lambda x, p: (x, None, 1), "pictures: none"),
+            (lambda x, p: (x, None, 1), "images: none"),
             (lambda x, p: (x, p[:, 1:], 1), "needs uint8 of shape .5, 6, 32, 32, 3"),
             (lambda x, p: (x, p[:4], 1), "needs uint8 of shape"),
             (lambda x, p: (x, p / 255, 1), "float64"),
@@ -83,10 +82,10 @@ class TestLearnedPredictor:
             LearnedPredictor.load(trained).predict(*change(*self.inputs()))
 
     def test_a_nan_before_the_memory_does_not_matter(self, trained: Path) -> None:
-        landmarks, pictures = self.inputs()
+        landmarks, images = self.inputs()
         landmarks[:, :2] = np.nan
         assert np.isfinite(
-            LearnedPredictor.load(trained).predict(landmarks, pictures, 2).landmarks
+            LearnedPredictor.load(trained).predict(landmarks, images, 2).landmarks
         ).all()
 
 

@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from face_prediction.dataset.manifest import fold_split
 from face_prediction.models.settings import PredictorTrainSettings
 from face_prediction.training.options import FaceTrainOptions
-from face_prediction.training.setup import CURVES, choose_people
-from face_prediction.training.trainer import StepMeans, torch_seed
+from face_prediction.training.trainer import CURVES, StepMeans, choose_people, torch_seed
 from face_prediction.training.windows import SequenceImages, WindowSampler
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.interrupt import StopRequest
@@ -105,7 +104,7 @@ class FakeDataset:
         self.folder = Path("fake")
         self.decoded: list[tuple[int, int, int]] = []
 
-    def pictures(self, index: int, frames: slice, reduce: int) -> np.ndarray:
+    def images(self, index: int, frames: slice, reduce: int) -> np.ndarray:
         self.decoded.append((index, frames.start, frames.stop))
         values = 20 * index + np.arange(frames.start, frames.stop)
         side = 64 // reduce

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from face_prediction.commands.train import run_train
-from face_prediction.models.checkpoint import read_tensors
+from face_prediction.models.learned import read_tensors
 from face_prediction.training import trainer as trainer_module
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import WindowBatch

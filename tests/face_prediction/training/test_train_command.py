@@ -15,8 +15,7 @@ import torch
 
 from face_prediction.commands.train import run_train
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.models.checkpoint import read_predictor_checkpoint, read_tensors
-from face_prediction.models.learned import LearnedPredictor
+from face_prediction.models.learned import LearnedPredictor, read_predictor_checkpoint, read_tensors
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.training.options import FaceTrainOptions
@@ -47,7 +46,7 @@ def changed(options: FaceTrainOptions, change: dict) -> FaceTrainOptions:
 def test_the_dataset_shows_what_it_says(dataset: Path) -> None:
     with FaceDataset(dataset) as faces:
         sequence = faces.read(3)
-    red = sequence.pictures[..., 0].astype(float) - sequence.pictures[..., 1] > 80
+    red = sequence.images[..., 0].astype(float) - sequence.images[..., 1] > 80
     seen = np.array([np.argwhere(frame).mean(axis=0)[::-1] + 0.5 for frame in red]) / 64
     expected = sequence.landmarks[:, list(LIPS), :2].mean(axis=1)
     np.testing.assert_allclose(seen, expected, atol=1.5 / 64)
@@ -86,15 +85,15 @@ def test_what_training_leaves(options: FaceTrainOptions, dataset: Path, model) -
     with FaceDataset(dataset) as faces:
         rows = [faces.read(int(i), reduce=2) for i in faces.indices(folds={1})]
     points = np.stack([row.landmarks[..., :2] for row in rows])
-    pictures = np.stack([row.pictures for row in rows])
-    forecast = predictor.predict(points[:, :8], pictures[:, 2:8], 2)
+    images = np.stack([row.images for row in rows])
+    forecast = predictor.predict(points[:, :8], images[:, 2:8], 2)
     still = np.repeat(points[:, 7:8], 2, axis=1)
     expected = mouth_distances(mouth_residuals(still, points[:, 8:])).mean()
     assert record.validation["persistence_mouth_error"] == pytest.approx(expected, rel=1e-5)
-    assert forecast.pictures is not None
-    change = (forecast.pictures.astype(float) - pictures[:, 8:]) / 255
+    assert forecast.images is not None
+    change = (forecast.images.astype(float) - images[:, 8:]) / 255
     assert record.validation["image"] == pytest.approx((change**2).mean(), rel=0.02)  # rounded
-    change = (pictures[:, 7:8].astype(float) - pictures[:, 8:]) / 255
+    change = (images[:, 7:8].astype(float) - images[:, 8:]) / 255
     assert record.validation["copy_image"] == pytest.approx((change**2).mean(), rel=1e-5)
     if model == "image_only":
         assert np.isnan(forecast.landmarks).all()
@@ -140,7 +139,7 @@ def test_help_does_not_load_torch(repository: Path) -> None:
 
 def test_without_torch_it_says_what_to_install(options, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "face_prediction.training.setup")
+    monkeypatch.delitem(sys.modules, "face_prediction.training.trainer")
     with pytest.raises(RequestError, match="pip install"):
         run_train(options)
 
