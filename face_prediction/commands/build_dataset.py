@@ -138,11 +138,7 @@ def read_rows(tracks: Iterable[Path], table: Path | None) -> dict[str, Attributi
 
 
 def refuse_same_video(entries: Iterable[ClipEntry]) -> None:
-    """Check that nobody can be trained on under one name and reported on under another.
-
-    Raises:
-        RequestError: the same video is there for two people.
-    """
+    """Raise RequestError if one video is of two people: trained on and reported on."""
     seen: dict[str, ClipEntry] = {}
     for entry in entries:
         first = seen.setdefault(entry.video_sha256, entry)
@@ -154,11 +150,7 @@ def refuse_same_video(entries: Iterable[ClipEntry]) -> None:
 
 
 def refuse_other_folder(out: Path) -> None:
-    """Check that ``out`` is new, empty, or a dataset, whole or begun.
-
-    Raises:
-        RequestError: it is a file, or holds something else.
-    """
+    """Raise RequestError unless ``out`` is new, empty, or a dataset, whole or begun."""
     require_out_folder(out)
     if (out / MANIFEST_NAME).exists():
         try:

@@ -145,11 +145,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
 
 
 def check_evaluate_options(options: EvaluateOptions) -> None:
-    """Check what can be checked before anything is read.
-
-    Raises:
-        RequestError: an option is out of its range.
-    """
+    """Raise RequestError if an option is out of its range, before anything is read."""
     for kind in options.kinds:
         require_choice("kind of footage", kind, KINDS)
     for name, least in (("seed", 0), ("resamples", 1), ("max_sequences", 2)):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from face_prediction.dataset.clip_file import open_clip, read_array, read_record
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.dataset.manifest import CLIP_FOLDER
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation.error_stats import (
@@ -137,10 +137,10 @@ def dataset_residuals(
     settings = dataset.manifest.settings
     truth = np.stack([dataset.landmarks(i)[settings.history :, :, :2] for i in selection.indices])
     forecasts = np.empty_like(truth)
-    plan = ImagePlan.of(predictor.needs)
     with tqdm(total=len(truth), unit="sequence", leave=False, disable=not progress) as bar:
         for places in selection.batches(min(map(batch_size, predictor.needs))):
-            batch = SequenceBatch(dataset, selection.indices[places].tolist(), plan)
+            indices = selection.indices[places].tolist()
+            batch = SequenceBatch(dataset, indices, predictor.needs)
             forecasts[places] = predictor.forecast(selection.rows_at(places), batch).landmarks
             bar.update(len(places))
     return MouthResiduals(

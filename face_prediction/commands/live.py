@@ -101,11 +101,7 @@ def run_live(options: LiveOptions) -> int:
 
 
 def check_live_options(options: LiveOptions) -> None:
-    """Check what can be checked before anything is read.
-
-    Raises:
-        RequestError: an option is out of its range, or the file to write is one that is read.
-    """
+    """Raise RequestError if an option is out of its range, or the file to write is the one read."""
     out, video = options.out, options.video
     if (options.camera is None) == (video is None):
         raise RequestError("give either --camera NUMBER or --video FILE")

@@ -148,11 +148,7 @@ def run_predict(options: PredictOptions) -> int:
 def require_same_motion(
     given: RecordedMotion, clips: Sequence[LiftedClip], settings: MotionSettings
 ) -> None:
-    """Check that a library was made from these clips.
-
-    Raises:
-        RequestError: one of its clips is missing, or it was made from other tracks.
-    """
+    """Raise RequestError if a clip of a library is missing, or it was made from other tracks."""
     missing = sorted(set(given.run_clip.tolist()) - {clip.row.clip for clip in clips})
     if missing:
         clip_names = ", ".join(missing)

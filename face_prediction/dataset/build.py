@@ -100,12 +100,8 @@ def build_clip(
 ) -> bool:
     """Make the file of the clip with the track at ``path``, unless it is up to date.
 
-    Args:
-        path: of the track.
-        videos: the videos to choose from, see `find_videos`.
-        out: folder of the dataset.
-        settings: of the sequences.
-        bar: first words of a progress bar; None: no bar.
+    ``videos`` are as `find_videos` gives them, ``out`` is the folder of the dataset, and ``bar``
+    holds the first words of a progress bar (None: no bar).
 
     Returns:
         True: it was made; False: it was there, from the same sources, and is kept.
@@ -162,12 +158,9 @@ def clip_entry(out: Path, row: Attribution, kind: str) -> ClipEntry:
 def track_frames(
     path: Path, track: FaceTrack, label: str | None = None
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Numbers and images (H, W, 3) of the decoded frames of a track's video.
+    """Numbers and images (H, W, 3) of the decoded frames of a track's video at ``path``.
 
-    Args:
-        path: the video.
-        track: of the same video.
-        label: of a progress bar; None: no bar.
+    ``label`` is that of a progress bar; None: no bar.
 
     Raises:
         RequestError: the video breaks off, or its frames are not those of the track.

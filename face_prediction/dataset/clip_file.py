@@ -118,13 +118,7 @@ def write_clip(
 ) -> None:
     """Write the file of one clip, whole or not at all. The same content gives the same bytes.
 
-    Args:
-        path: the file; replaced if it is there.
-        frames: of the whole clip.
-        sequences: starts, crops and counts.
-        images: of the sequences.
-        statistics: the columns of `STATISTICS`, each (N,).
-        record: sources and settings of the file; see `build.clip_record`.
+    ``statistics`` are the columns of `STATISTICS`, each (N,), ``record`` sources and settings.
     """
     with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
         file.attrs["schema"] = SCHEMA

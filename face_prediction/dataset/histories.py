@@ -58,14 +58,8 @@ def find_origins(
 
     A history does not reach back across a lost face, a spike or a jump of the detector; where
     that leaves less, the face is taken to have been at rest before.
-
-    Args:
-        frames: of the clip, each in a stretch without any of those.
-        landmarks: (T of the clip, L, 2 or 3) normalised image coordinates.
-        image_size: (width, height) in pixels.
-        quality: of the clip's frames.
-        length: frames of a history.
-        margin: of the crop, see `crop_around`.
+    ``frames`` are each in a stretch without any of those; ``landmarks`` (T of the clip, L, 2 or 3)
+    are normalised image coordinates, and ``margin`` is that of `crop_around`.
     """
     begins = np.zeros(len(landmarks), dtype=np.int64)
     for start, stop in quality.segments():
@@ -109,13 +103,8 @@ def history_images(
 ) -> Iterator[NDArray[np.uint8]]:
     """The images (P, S, S, 3) of each of ``origins``, whose frames must increase.
 
-    Args:
-        path: the video.
-        track: of the same video.
-        source_frame: (T of the clip,) the decoded frame nearest to each frame.
-        origins: frames that are forecast from.
-        needs: how many images, and of what size.
-        settings: of the dataset.
+    They are cut out of the video at ``path``, that of ``track``; ``source_frame`` (T of the clip,)
+    is the decoded frame nearest to each frame.
 
     Raises:
         RequestError: the video breaks off, or is not the one of the track; or a dataset with these
@@ -147,11 +136,8 @@ def history_images(
 def mouth_ahead(mouth: Array, now: Array, ahead: Array, image_size: Size) -> NDArray[np.float64]:
     """Mouth positions (N, H, 3) in metres from forecasts of the mouth centre in the image.
 
-    Args:
-        mouth: (N, 3) m, present position; camera frame.
-        now: (N, 2) present centre, normalised image coordinates.
-        ahead: (N, H, 2) forecast centre.
-        image_size: (width, height) in pixels.
+    ``mouth`` (N, 3) m is the present position in the camera frame; ``now`` (N, 2) is the present
+    centre and ``ahead`` (N, H, 2) the forecast ones, in normalised image coordinates.
     """
     moved = image_rays(ahead, image_size) - image_rays(now, image_size)[:, None]
     here = np.asarray(mouth, dtype=np.float64)[:, None]
@@ -161,14 +147,10 @@ def mouth_ahead(mouth: Array, now: Array, ahead: Array, image_size: Size) -> NDA
 def forecast_metres(
     origins: Sequence[Origin], forecasts: Array, landmarks: Array, mouth: Array, image_size: Size
 ) -> NDArray[np.float64]:
-    """Mouth positions (N, H, 3) in metres of forecasts (N, H, L, 2) in crops.
+    """Mouth positions (N, H, 3) in metres of forecasts (N, H, L, 2) in the crops of N origins.
 
-    Args:
-        origins: N of them.
-        forecasts: one for each.
-        landmarks: (T of the clip, L, 2 or 3) normalised image coordinates.
-        mouth: (T of the clip, 3) m.
-        image_size: (width, height) in pixels.
+    Of the whole clip: ``landmarks`` (T, L, 2 or 3), normalised image coordinates, and ``mouth``
+    (T, 3) m.
     """
     frames = [origin.frame for origin in origins]
     pairs = zip(origins, mouth_centre(forecasts), strict=True)

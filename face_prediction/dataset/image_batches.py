@@ -5,8 +5,7 @@ Legend: B sequences, T frames of history, H horizon, L = 468 landmarks, P images
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,35 +15,14 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.prediction.interface import ImageNeeds
 
 
-@dataclass(frozen=True)
-class ImagePlan:
-    """Images to decode.
-
-    Attributes:
-        history: for each side S, the number of frames at the end of the history.
-        future: sides at which the frames to be forecast are decoded, too.
-    """
-
-    history: Mapping[int, int]
-    future: frozenset[int]
-
-    @classmethod
-    def of(cls, needs: Iterable[ImageNeeds], future: Iterable[int] = ()) -> ImagePlan:
-        """The plan that serves all ``needs``, with the future at the sides ``future``."""
-        history: dict[int, int] = {}
-        for need in needs:
-            if need.frames:
-                history[need.size] = max(need.frames, history.get(need.size, 0))
-        return cls(history, frozenset(future))
-
-
 class SequenceBatch:
     """Landmarks and images of B sequences.
 
     Args:
         dataset: the open dataset.
         indices: (B,) sequences.
-        plan: images to decode.
+        needs: images of the history to decode.
+        future_sizes: sides at which the frames to be forecast are decoded, too.
         images_of: (B,) sequences whose images stand in for their own (shuffled-image ablation).
 
     Attributes:
@@ -56,7 +34,8 @@ class SequenceBatch:
         self,
         dataset: FaceDataset,
         indices: Sequence[int],
-        plan: ImagePlan,
+        needs: Iterable[ImageNeeds],
+        future_sizes: Iterable[int] = (),
         images_of: Sequence[int] | None = None,
     ) -> None:
         settings = dataset.manifest.settings
@@ -66,9 +45,13 @@ class SequenceBatch:
         self._past: dict[int, NDArray[np.uint8]] = {}
         self._future: dict[int, NDArray[np.uint8]] = {}
         sources = indices if images_of is None else images_of
-        for size in sorted({*plan.history, *plan.future}):
-            past = plan.history.get(size, 0)
-            stop = settings.length if size in plan.future else settings.history
+        most = dict.fromkeys(future_sizes, 0)  # side -> images of the history
+        stops = dict.fromkeys(most, settings.length)
+        for need in needs:
+            if need.frames:
+                most[need.size] = max(need.frames, most.get(need.size, 0))
+        for size, past in sorted(most.items()):
+            stop = stops.get(size, settings.history)
             wanted = slice(settings.history - past, stop)
             reduce = reduction(settings.crop_size, size)
             images = np.stack([dataset.images(index, wanted, reduce) for index in sources])

@@ -120,11 +120,7 @@ def assign_folds(clips: Iterable[ClipEntry], folds: int, seed: int) -> dict[str,
 
 
 def require_fold_options(folds: int, seed: int) -> None:
-    """Check both numbers before any work is done.
-
-    Raises:
-        RequestError: one is out of its range.
-    """
+    """Raise RequestError if a number is out of its range, before any work is done."""
     if folds < 1:
         raise RequestError(f"--folds {folds}: 1 or more")
     if seed < 0:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.evaluation.scoring import LEVELS, EvaluationScores
 from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
 from face_prediction.evaluation.statistics import KindSummary
@@ -71,7 +71,7 @@ def write_figures(
         for predictor in setup.predictors:
             if not (size := predictor.image_size):
                 continue
-            batch = SequenceBatch(setup.dataset, [index], ImagePlan.of(predictor.needs, [size]))
+            batch = SequenceBatch(setup.dataset, [index], predictor.needs, [size])
             truth = Forecast(batch.future, batch.future_images(size))
             name = re.sub(r"\W+", "_", predictor.name).strip("_")
             path = folder / f"forecast_{summary.kind}_{name}.png"

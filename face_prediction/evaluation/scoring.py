@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch
+from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.evaluation.predictors import Role, find_landmarks
 from face_prediction.evaluation.setup import EvaluationSetup, SequenceSelection
 from face_prediction.prediction.errors import mouth_residuals, normalised_mean_errors
@@ -190,11 +190,12 @@ def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> Evaluatio
     last_images = {size: ImageNeeds(1, size) for size in setup.sizes}
     copies = {size: np.full(shape, np.nan) for size in setup.sizes if size > setup.common_size}
     needs = [needs for predictor in setup.predictors for needs in predictor.needs]
-    plan = ImagePlan.of([*needs, *last_images.values()], setup.sizes)
+    needs += last_images.values()
     total = len(selection) * len(rows)
     with tqdm(total=total, unit="forecast", leave=False, disable=not progress) as bar:
         for places in selection.batches(BATCH):
-            batch = SequenceBatch(dataset, selection.indices[places].tolist(), plan)
+            indices = selection.indices[places].tolist()
+            batch = SequenceBatch(dataset, indices, needs, setup.sizes)
             for predictor, row in zip(setup.predictors, rows, strict=True):
                 forecast = predictor.forecast(selection.rows_at(places), batch)
                 _score(row, places, forecast, batch, setup.common_size)
@@ -224,12 +225,12 @@ def score_shuffled_images(
     Landmarks stay a sequence's own; images are those of the sequences at ``partners`` (N,).
     """
     indices, networks = setup.selection.indices, setup.image_networks
-    plan = ImagePlan.of(needs for network in networks for needs in network.needs)
+    needs = [needs for network in networks for needs in network.needs]
     total = len(indices) * len(networks)
     with tqdm(total=total, unit="forecast", leave=False, disable=not progress) as bar:
         for places in setup.selection.batches(BATCH):
-            images_of = indices[partners[places]].tolist()
-            batch = SequenceBatch(setup.dataset, indices[places].tolist(), plan, images_of)
+            own, images_of = indices[places].tolist(), indices[partners[places]].tolist()
+            batch = SequenceBatch(setup.dataset, own, needs, images_of=images_of)
             for network in networks:
                 forecast = network.forecast(setup.selection.rows_at(places), batch)
                 residuals = mouth_residuals(forecast.landmarks, batch.future)

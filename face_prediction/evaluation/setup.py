@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.dataset.image_batches import ImagePlan, SequenceBatch, reduction
+from face_prediction.dataset.image_batches import SequenceBatch, reduction
 from face_prediction.dataset.manifest import SequenceRow
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation.predictors import (
@@ -206,7 +206,7 @@ def prepare_evaluation(
     sizes: dict[str, int] = {}
     without_landmarks: set[str] = set()
     for predictor in predictors:
-        batch = SequenceBatch(dataset, [int(selection.indices[0])], ImagePlan.of(predictor.needs))
+        batch = SequenceBatch(dataset, [int(selection.indices[0])], predictor.needs)
         forecast = predictor.forecast(selection.rows[:1], batch)
         if forecast.images is not None:
             sizes[predictor.name] = forecast.images.shape[2]

@@ -224,13 +224,7 @@ def lift_clips(
     settings: MotionSettings,
     only: Collection[str] | None = None,
 ) -> tuple[list[LiftedClip], int]:
-    """Lift the clips that may ship, and count those that may not.
-
-    Args:
-        tracks: files, or folders of files.
-        table: attributions; None: all may ship.
-        settings: of the motion.
-        only: names of clips to lift; None: all that may ship.
+    """Lift the clips that may ship (of the names ``only``, if given), and count those that may not.
 
     Raises:
         RequestError: a track has no row or cannot be used.

@@ -288,11 +288,8 @@ def extract_track(
 ) -> FaceTrack:
     """Read the video at ``path`` and follow one face through it.
 
-    Args:
-        path: the video.
-        detector: with the settings' detector settings.
-        settings: of the track.
-        label: of a progress bar; None: no bar.
+    ``detector`` has the settings' detector settings; ``label`` is that of a progress bar, None: no
+    bar.
 
     Raises:
         RequestError: the video cannot be read to its end.

@@ -26,11 +26,7 @@ class VideoFrame:
 
 
 def require_video(path: Path) -> None:
-    """Check that ``path`` is a file that can be read.
-
-    Raises:
-        RequestError: it is absent, a folder, empty or unreadable.
-    """
+    """Raise RequestError if ``path`` is absent, a folder, empty or unreadable."""
     if path.is_dir():
         raise RequestError(f"{path}: is a folder; name video files")
     if not path.exists():
@@ -133,9 +129,6 @@ def upright(image: np.ndarray, rotation: int) -> np.ndarray:
 def with_bar(
     frames: Iterable[VideoFrame], total: int | None, label: str | None
 ) -> Iterable[VideoFrame]:
-    """Pass on ``frames`` under a progress bar called ``label``; None: without a bar.
-
-    ``total`` is the number of frames, None where it is not known.
-    """
-    shown = label is not None
-    return tqdm(frames, total=total, desc=label, unit="frame", leave=False, disable=not shown)
+    """Pass on ``frames`` (``total``, if known) under a progress bar ``label``; None: no bar."""
+    disable = label is None
+    return tqdm(frames, total=total, desc=label, unit="frame", leave=False, disable=disable)

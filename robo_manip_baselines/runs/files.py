@@ -196,11 +196,7 @@ def _not_writable(folder: Path, error: OSError) -> RequestError:
 
 
 def require_out_file(out: Path, load: Callable[[Path], object] | None = None) -> None:
-    """Check that ``out`` can be a file, and that only what ``load`` reads is overwritten by it.
-
-    Raises:
-        RequestError: it is a folder, or a file that ``load`` refuses.
-    """
+    """Raise RequestError if ``out`` is a folder, or a file that ``load`` refuses to read."""
     if out.is_dir():
         raise RequestError(f"--out {out}: is a folder; name a file")
     if load is not None and out.exists():

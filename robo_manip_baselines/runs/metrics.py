@@ -36,11 +36,9 @@ class Board(Protocol):
 
     def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
         """Show a number."""
-        ...
 
     def close(self) -> None:
         """Write out what is left."""
-        ...
 
 
 class MetricsLog:

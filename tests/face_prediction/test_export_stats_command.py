@@ -102,7 +102,9 @@ class Watched:
         return Forecast(ahead.astype(np.float32))
 
 
-def use(monkeypatch, fits: EvaluatedPredictor) -> None:
+def use(monkeypatch, by_fold: dict[int, Watched], trained_on=frozenset()) -> None:
+    fitted = {fold: FittedPredictor(watched, trained_on) for fold, watched in by_fold.items()}
+    fits = EvaluatedPredictor("watched", fitted)
     monkeypatch.setattr(export_stats_command, "cross_fit", lambda *_: fits)
 
 
@@ -179,10 +181,7 @@ def test_each_fold_is_forecast_by_its_own_predictor(options, monkeypatch) -> Non
     with FaceDataset(options.dataset) as dataset:
         fold_of = {clip.subject: clip.fold or 0 for clip in dataset.manifest.clips}
     watched = {fold: Watched((0.1 * fold, 0.0)) for fold in range(3)}
-    fits = EvaluatedPredictor(
-        "watched", {f: FittedPredictor(w, frozenset()) for f, w in watched.items()}
-    )
-    use(monkeypatch, fits)
+    use(monkeypatch, watched)
     assert run_export_stats(options) == 0
     for run in load_predictor_error_stats(options.out).residuals:
         expected = 0.1 * fold_of[run.subject] - 0.015
@@ -195,12 +194,7 @@ def test_each_fold_is_forecast_by_its_own_predictor(options, monkeypatch) -> Non
 
 def test_pictures_are_the_last_of_the_history(options, monkeypatch) -> None:
     watched = Watched(needs=ImageNeeds(3, 32))
-    use(
-        monkeypatch,
-        EvaluatedPredictor(
-            "watched", dict.fromkeys(range(3), FittedPredictor(watched, frozenset()))
-        ),
-    )
+    use(monkeypatch, dict.fromkeys(range(3), watched))
     assert run_export_stats(replace(options, kind="head_motion")) == 0
     ((_, images),) = watched.shown
     with FaceDataset(options.dataset) as dataset:
@@ -214,7 +208,7 @@ def test_a_fold_without_a_checkpoint_is_left_out(options, monkeypatch) -> None:
     with FaceDataset(options.dataset) as dataset:
         fold_of = {clip.subject: clip.fold or 0 for clip in dataset.manifest.clips}
     fold = fold_of["bob"]
-    use(monkeypatch, EvaluatedPredictor("watched", {fold: FittedPredictor(Watched(), frozenset())}))
+    use(monkeypatch, {fold: Watched()})
     assert run_export_stats(options) == 0
     stats = load_predictor_error_stats(options.out)
     assert [run.subject for run in stats.residuals] == [
@@ -223,8 +217,7 @@ def test_a_fold_without_a_checkpoint_is_left_out(options, monkeypatch) -> None:
 
 
 def test_whoever_was_trained_on_is_not_judged(options, monkeypatch) -> None:
-    fits = {fold: FittedPredictor(Watched(), frozenset({"bob", "dora"})) for fold in range(3)}
-    use(monkeypatch, EvaluatedPredictor("watched", fits))
+    use(monkeypatch, dict.fromkeys(range(3), Watched()), frozenset({"bob", "dora"}))
     with pytest.raises(RequestError, match="trained on subject 'bob'"):
         run_export_stats(options)
     assert not options.out.exists()
@@ -271,12 +264,7 @@ def test_what_cannot_be_done_is_refused(options, change, message: str) -> None:
 
 def test_a_picture_size_that_the_dataset_has_not_is_refused(options, monkeypatch) -> None:
     watched = Watched(needs=ImageNeeds(1, 48))
-    use(
-        monkeypatch,
-        EvaluatedPredictor(
-            "watched", dict.fromkeys(range(3), FittedPredictor(watched, frozenset()))
-        ),
-    )
+    use(monkeypatch, dict.fromkeys(range(3), watched))
     with pytest.raises(RequestError, match="images of 48 pixels: this dataset can give 64, 32, "):
         run_export_stats(options)
 

@@ -121,11 +121,11 @@ def test_the_command_line(capsys) -> None:
 
 @pytest.mark.parametrize("option", ["--shuffle_images", "--shuffle-images", "--shuffle_pictures"])
 def test_the_old_name_of_the_ablation_works(option: str, monkeypatch) -> None:
-    given = []
-    monkeypatch.setattr(
-        cli,
-        "COMMANDS",
-        tuple((n, o, given.append if n == "evaluate" else r) for n, o, r in cli.COMMANDS),
-    )
+    given: list[EvaluateOptions] = []
+
+    def note(options: EvaluateOptions) -> None:
+        given.append(options)
+
+    monkeypatch.setattr("face_prediction.commands.evaluate.run_evaluate", note)
     assert cli.main(["evaluate", "--dataset", "d", option]) == 0
     assert given[0].shuffle_images
