@@ -25,7 +25,7 @@ from face_prediction.forecast import (
     fit_forecaster,
     mouth_centre,
 )
-from face_prediction.models.residual.prior import EXPERTS, AdaptivePrior, Expert
+from face_prediction.models.residual.prior import EXPERTS, AdaptivePrior, LinearExpert
 
 HISTORY, HORIZON = 70, 5
 SHAPES = 8
@@ -34,7 +34,7 @@ SEED = 0
 DRAWS = 3
 BATCH = 64
 
-VARIANTS: dict[str, tuple[Expert, ...]] = {
+VARIANTS: dict[str, tuple[LinearExpert, ...]] = {
     "the whole prior": EXPERTS,
     "no expert learns from periods": tuple(e for e in EXPERTS if not e.periodic),
     "no expert adapts": tuple(e for e in EXPERTS if e.shrink is None),
@@ -65,7 +65,7 @@ def main() -> None:
         forecaster = fit_forecaster(name, sequences)
         return mouth_centre(forecaster.predict(landmarks[test, :HISTORY], HORIZON))
 
-    def prior(experts: tuple[Expert, ...], train: np.ndarray, test: np.ndarray) -> np.ndarray:
+    def prior(experts: tuple[LinearExpert, ...], train: np.ndarray, test: np.ndarray) -> np.ndarray:
         model = AdaptivePrior(HORIZON, SHAPES, experts)
         model.fit(LandmarkSequences(landmarks[train], tuple(subjects[train])))
         parts: list[np.ndarray] = []

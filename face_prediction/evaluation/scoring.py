@@ -129,8 +129,7 @@ class PredictorScores:
     """Scores of one row of the tables; NaN where it has no such forecast.
 
     Attributes:
-        name: of the row.
-        role: of the row.
+        name: of the row, and its ``role``.
         image_size: side of the images that it makes; 0: none.
         residuals: (N, H, 2) forecast minus truth of the mouth centre, in crops.
         shuffled_residuals: (N, H, 2) with the images of other sequences.
@@ -165,8 +164,7 @@ class EvaluationScores:
         selection: the sequences.
         rows: one for each predictor, and for a detector on the true images.
         common_size: side of the images at which all rows are compared.
-        copies: for each larger side that images were made at, SSIM (N, H) of copies of the last
-            one.
+        copies: SSIM (N, H) of copies of the last image, for each larger side of images made.
     """
 
     selection: SequenceSelection

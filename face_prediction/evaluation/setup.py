@@ -165,8 +165,7 @@ class EvaluationSetup:
         selection: the sequences.
         predictors: one row of the tables each.
         common_size: side at which all images are compared: the smallest that a predictor makes.
-        detector: finds the face in the images of those that forecast no landmarks; None: not
-            needed.
+        detector: finds the face in images of those that forecast no landmarks; None: not needed.
         detected_size: the largest side of those images.
     """
 

@@ -41,10 +41,38 @@ class BootstrapEstimate:
     high: Floats
 
 
+def bootstrap_mean(
+    values: Floats,
+    subjects: Sequence[str],
+    *,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> BootstrapEstimate:
+    """Mean of ``values`` (N, ...), NaN left out, with its interval over people and sequences.
+
+    Args:
+        values: one row a sequence. Models that are compared stand side by side in a row, so that
+            every resample holds the same sequences of both.
+        subjects: N names.
+        level: share of resamples inside the interval.
+        resamples: number of them, drawn from ``seed``.
+        seed: of the resampling.
+
+    Raises:
+        RequestError: no rows, not one subject a row, or a level or number out of range.
+    """
+    if len(values) == 0 or len(values) != len(subjects):
+        raise RequestError(f"{len(subjects)} subjects for {len(values)} sequences; one for each")
+    if not 0 < level < 1:
+        raise RequestError(f"level {level}; must be between 0 and 1")
+    counts = resample_counts(subjects, resamples, seed)
+    (mean,) = _mean(values, np.ones((1, len(values))))
+    return BootstrapEstimate(mean, *_percentile_bounds(_mean(values, counts), level))
+
+
 def resample_counts(subjects: Sequence[str], resamples: int, seed: int) -> Floats:
     """Number of times (W, N) that each sequence is in each of ``resamples``, drawn from ``seed``.
-
-    Models that are compared have the same sequences in every resample.
 
     Raises:
         RequestError: no rows, or a number out of range.
@@ -89,9 +117,7 @@ class KindSummary:
 
     Attributes:
         kind: of footage.
-        sequences: number of them.
-        subjects: number of people.
-        clips: number of them.
+        sequences: number of them, of so many ``subjects`` and ``clips``.
         common_size: side at which all images are compared.
         rows: R of them, the first axis of ``numbers``.
         best_baseline: the baseline with the least mean distance over the far frames.
@@ -169,7 +195,7 @@ def summarise_kind(
         ),
         best_baseline=rows[best].name,
         numbers={
-            name: BootstrapEstimate(value, *percentile_bounds(drawn[name]))
+            name: BootstrapEstimate(value, *_percentile_bounds(drawn[name]))
             for name, (value,) in whole.items()
         },
     )
@@ -206,12 +232,12 @@ def _numbers(
     result: dict[str, Floats] = {}
     absolute, distance = data["absolute"], data["distance"]
     for prefix, frames in (("", None), ("pooled_", 2)):
-        mean = weighted_mean(absolute, weight, frames)
-        square = weighted_mean(absolute**2, weight, frames)
+        mean = _mean(absolute, weight, frames)
+        square = _mean(absolute**2, weight, frames)
         result[f"{prefix}mean"] = mean
         result[f"{prefix}variance"] = np.maximum(square - mean**2, 0.0)
         for name in (*AVERAGED, "coverage"):
-            result[f"{prefix}{name}"] = weighted_mean(data[name], weight, frames)
+            result[f"{prefix}{name}"] = _mean(data[name], weight, frames)
     persistence, baseline = (
         np.broadcast_to(distance[:, [row]], distance.shape) for row in (reference, best)
     )
@@ -227,7 +253,7 @@ def _numbers(
     return result
 
 
-def weighted_mean(values: Floats, weight: Floats, frames: int | None = None) -> Floats:
+def _mean(values: Floats, weight: Floats, frames: int | None = None) -> Floats:
     """Weighted mean of (N, ...) over sequences, and axis ``frames`` if given; without NaN."""
     total, count = _sums(values, ~np.isnan(values), weight, frames)
     return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
@@ -251,7 +277,7 @@ def _sums(
     return np.tensordot(weight, total, axes=1), np.tensordot(weight, count, axes=1)
 
 
-def percentile_bounds(drawn: Floats, level: float = 0.95) -> tuple[Floats, Floats]:
+def _percentile_bounds(drawn: Floats, level: float = 0.95) -> tuple[Floats, Floats]:
     """Lower and upper bounds (...) of the middle ``level`` of resampled statistics (W, ...).
 
     NaN where no resample has a number.

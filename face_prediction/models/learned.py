@@ -42,17 +42,16 @@ CONFIG_FILE = "config.json"
 
 
 class LearnedPredictor:
-    """`Predictor` that runs a network on batches of histories.
+    """`Predictor` that runs a network, on its device, on batches of histories.
 
     Args:
-        model: on its device; put into eval mode.
+        model: put into eval mode.
         record: its provenance.
         batch_size: histories that go through the network at once.
 
     Attributes:
         name: of the network, in the registry.
         memory: frames of landmarks that it sees; a history must have as many or more.
-        needs: images that it sees.
         horizon: most frames that it predicts.
     """
 

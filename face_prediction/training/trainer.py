@@ -354,9 +354,7 @@ class PredictorTrainer:
         model, optimizer, progress = self._model, self._optimizer, self.progress
         done = (settings.steps, progress.step, progress.seconds)
         bar = StepProgress(*done, shown=options.progress, log_every=options.log_every)
-        batches = window_batches(
-            self._windows, settings.batch_size, seed, progress.step, settings.steps
-        )
+        batches = window_batches(self._windows, settings, seed, progress.step)
         log = MetricsLog(options.folder / METRICS_FILE, progress.step, board=None)
         with bar, log, contextlib.closing(batches):
             self._save(bar.seconds)

@@ -19,6 +19,7 @@ from torch import Tensor
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History, PredictorModel
+from face_prediction.models.settings import PredictorTrainSettings
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.seeds import stream_generator
@@ -185,14 +186,14 @@ class SequenceWindows:
 
 
 def window_batches(
-    windows: SequenceWindows, batch_size: int, seed: int, start: int, stop: int
+    windows: SequenceWindows, settings: PredictorTrainSettings, seed: int, start: int
 ) -> Generator[WindowBatch]:
-    """Yield the batches of the steps ``start`` to ``stop``, each read while the last is used.
+    """Yield the batches of the steps from ``start`` to the last, each read while one is used.
 
     To be closed, where it is not used up.
     """
-    length = windows.sequences.landmarks.shape[1]
-    sampler = WindowSampler(len(windows), length, windows.frames, batch_size, seed)
+    length, stop = windows.sequences.landmarks.shape[1], settings.steps
+    sampler = WindowSampler(len(windows), length, windows.frames, settings.batch_size, seed)
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as worker:
         following = worker.submit(windows.batch, *sampler.batch(start))
         for step in range(start + 1, stop + 1):

@@ -8,12 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from face_prediction.evaluation.statistics import (
-    BootstrapEstimate,
-    percentile_bounds,
-    resample_counts,
-    weighted_mean,
-)
+from face_prediction.evaluation.statistics import bootstrap_mean
 from face_prediction.prediction.errors import (
     mouth_distances,
     mouth_errors,
@@ -29,14 +24,6 @@ def pair_of_faces(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     truth = rng.uniform(0.2, 0.8, (7, 5, 468, 2))
     return truth + rng.normal(0, 0.01, truth.shape), truth
-
-
-def bootstrap_mean(
-    values: np.ndarray, subjects: list[str], level: float = 0.95, resamples: int = 2000, seed=0
-) -> BootstrapEstimate:
-    (mean,) = weighted_mean(values, np.ones((1, len(values))))
-    counts = resample_counts(subjects, resamples, seed)
-    return BootstrapEstimate(mean, *percentile_bounds(weighted_mean(values, counts), level))
 
 
 def test_residual_is_forecast_minus_truth_of_the_lips() -> None:
@@ -226,11 +213,17 @@ def test_rows_without_a_forecast_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("subjects", "resamples", "seed", "words"),
-    [([], 9, 0, "no sequences"), (["a"], 0, 0, "resamples"), (["a"], 9, -1, "seed")],
+    ("values", "subjects", "options", "told"),
+    [
+        (np.zeros(0), [], {}, "0 subjects"),
+        (np.zeros(3), ["a"], {}, "1 subjects for 3"),
+        (np.zeros(1), ["a"], {"level": 1.0}, "level"),
+        (np.zeros(1), ["a"], {"resamples": 0}, "resamples"),
+        (np.zeros(1), ["a"], {"seed": -1}, "seed"),
+    ],
 )
 def test_wrong_bootstrap_is_refused(
-    subjects: list[str], resamples: int, seed: int, words: str
+    values: np.ndarray, subjects: list[str], options: dict, told: str
 ) -> None:
-    with pytest.raises(RequestError, match=words):
-        resample_counts(subjects, resamples, seed)
+    with pytest.raises(RequestError, match=told):
+        bootstrap_mean(values, subjects, **options)

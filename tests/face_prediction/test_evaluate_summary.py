@@ -14,13 +14,7 @@ from face_prediction.dataset.manifest import SequenceRow
 from face_prediction.evaluation.predictors import Role
 from face_prediction.evaluation.scoring import LEVELS, EvaluationScores, PredictorScores
 from face_prediction.evaluation.setup import SequenceSelection
-from face_prediction.evaluation.statistics import (
-    KindSummary,
-    percentile_bounds,
-    resample_counts,
-    summarise_kind,
-    weighted_mean,
-)
+from face_prediction.evaluation.statistics import KindSummary, bootstrap_mean, summarise_kind
 from face_prediction.evaluation.tables import (
     EvaluationReport,
     markdown_text,
@@ -146,12 +140,10 @@ def test_intervals_are_those_of_a_bootstrap_over_people(scores: EvaluationScores
 def test_one_bootstrap_is_that_of_each_number_by_itself(scores: EvaluationScores) -> None:
     summary = summarise_kind(scores, "natural", seed=3, resamples=250)
     subjects = [row.subject for row in scores.selection.rows[:20]]
-    nme, counts = scores.rows[3].nme[:20], resample_counts(subjects, 250, 3)
-    low, high = percentile_bounds(weighted_mean(nme, counts))
+    expected = bootstrap_mean(scores.rows[3].nme[:20], subjects, seed=3, resamples=250)
     found = summary.numbers["nme"]
-    np.testing.assert_allclose(found.value[3], np.nanmean(nme, axis=0))
-    np.testing.assert_allclose(found.low[3], low)
-    np.testing.assert_allclose(found.high[3], high)
+    for part in ("value", "low", "high"):
+        np.testing.assert_allclose(getattr(found, part)[3], getattr(expected, part))
 
 
 def test_images_are_compared_at_one_size_and_at_their_own(

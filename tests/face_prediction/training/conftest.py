@@ -145,8 +145,8 @@ def before_step(monkeypatch) -> Callable[[Callable[[int, WindowBatch], WindowBat
     original = trainer_module.window_batches
 
     def install(function: Callable[[int, WindowBatch], WindowBatch | None]) -> None:
-        def hooked(windows, batch_size: int, seed: int, start: int, stop: int):
-            batches = original(windows, batch_size, seed, start, stop)
+        def hooked(windows, settings, seed: int, start: int):
+            batches = original(windows, settings, seed, start)
             with contextlib.closing(batches):
                 for step, batch in enumerate(batches, start):
                     yield function(step, batch) or batch
