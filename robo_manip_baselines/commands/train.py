@@ -19,13 +19,7 @@ from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.metrics import read_metrics
 from robo_manip_baselines.runs.progress import closing_table
-from robo_manip_baselines.training.config import (
-    CONFIG,
-    METRICS,
-    Network,
-    TrainConfig,
-    read_config,
-)
+from robo_manip_baselines.training.config import CONFIG, METRICS, Network, TrainConfig, read_config
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 logger = logging.getLogger(__name__)

@@ -267,10 +267,7 @@ def write_preview(path: Path, episodes: Sequence[Path]) -> None:
 
 def preview_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
     """Replay an episode and draw it; yield (H, 3 W, 3) uint8 frames."""
-    with (
-        EpisodeReader(path) as episode,
-        closing(remake_env(episode, cameras=(), **LOOK)) as env,
-    ):
+    with EpisodeReader(path) as episode, closing(remake_env(episode, cameras=(), **LOOK)) as env:
         world = world_of(env)
         target = episode.array(world.task.target_field)[:, 0]
         names, phases = episode.attributes["phase_names"], episode.array("phase")

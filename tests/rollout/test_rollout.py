@@ -231,10 +231,7 @@ def test_what_goes_wrong_in_a_worker_is_reported(env_config: EnvConfig) -> None:
     ):
         rollout(Lost(1), envs, [0])
     wrong = replace(env_config, env_kwargs={"clips": ("me",)})
-    with (
-        open_envs(wrong, 1, 1) as envs,
-        pytest.raises(RequestError, match="unknown clip 'me'"),
-    ):
+    with open_envs(wrong, 1, 1) as envs, pytest.raises(RequestError, match="unknown clip 'me'"):
         rollout(Recurrent(1), envs, [0])
     assert multiprocessing.active_children() == []
 

@@ -214,8 +214,7 @@ def test_missing_demonstrations_name_the_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("device", "message"),
-    [("tpu", "must be auto, cpu, cuda"), ("cuda:99", "device 'cuda:99'")],
+    ("device", "message"), [("tpu", "must be auto, cpu, cuda"), ("cuda:99", "device 'cuda:99'")]
 )
 def test_devices_that_are_not_there(device: str, message: str, line: str) -> None:
     with pytest.raises(RequestError, match=message):

@@ -438,10 +438,7 @@ class ActModel(PolicyModel):
         state = state[:, -1]
         if latent is None:
             latent = state.new_zeros((state.shape[0], self.config.latent_size))
-        tokens = [
-            self.latent_projection(latent)[:, None],
-            self.state_projection(state)[:, None],
-        ]
+        tokens = [self.latent_projection(latent)[:, None], self.state_projection(state)[:, None]]
         positions: list[Tensor] = [self.token_positions]
         if self.vision is not None:
             image_tokens, image_positions = self.vision(images)
