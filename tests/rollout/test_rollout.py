@@ -81,9 +81,9 @@ def play(policy: ActingPolicy, envs: EnvPool, seeds: list[int]) -> Played:
     return results, recordings
 
 
-def network(checkpoint: Checkpoint, acting: ActionExecution, num_envs: int) -> PolicyRunner:
+def network(checkpoint: Checkpoint, execution: ActionExecution, num_envs: int) -> PolicyRunner:
     model, spec = load_model(checkpoint), checkpoint.spec
-    return PolicyRunner(model, spec, checkpoint.normalization, acting, num_envs=num_envs)
+    return PolicyRunner(model, spec, checkpoint.normalization, execution, num_envs=num_envs)
 
 
 POLICIES: dict[str, Callable[[Checkpoint, int], ActingPolicy]] = {
@@ -257,7 +257,9 @@ class Seeing(PolicyModel):
 
     chunk_size = 4
 
-    def predict(self, state: torch.Tensor, images: torch.Tensor | None) -> torch.Tensor:
+    def predict(
+        self, state: torch.Tensor, images: torch.Tensor | None, noise: torch.Tensor | None
+    ) -> torch.Tensor:
         assert images is not None
         seen = images.float().flatten(1) / 255
         weight = torch.linspace(-1, 1, seen.shape[1])
@@ -273,9 +275,9 @@ def test_a_network_that_sees_acts_the_same_in_any_arrangement(env_config: EnvCon
     ones, zeros = np.ones(seen.vector_size, np.float32), np.zeros(seen.vector_size, np.float32)
     scale = Normalization(zeros, ones, zeros[:7], ones[:7])
     played = []
-    for acting in (ActionExecution(), FIRST):
+    for execution in (ActionExecution(), FIRST):
         for num_envs, workers in ((1, 0), (3, 2)):
-            policy = PolicyRunner(Seeing(), spec, scale, acting, num_envs=num_envs)
+            policy = PolicyRunner(Seeing(), spec, scale, execution, num_envs=num_envs)
             with open_envs(seen, num_envs, workers) as envs:
                 _, recordings = play(policy, envs, SEEDS)
             played.append(np.array([recordings[seed].actions for seed in SEEDS]))
