@@ -108,9 +108,10 @@ def rollout(
         if not numbers:
             return []
         env_ids = np.array(numbers, dtype=np.intp)
-        vectors = arrays.vectors[env_ids]
-        actions = policy.act(vectors, arrays.images[env_ids] if has_images else None, env_ids)
-        arrays.actions[env_ids] = actions
+        vectors = arrays["vectors"][env_ids]
+        images = arrays["images"][env_ids] if has_images else None
+        actions = policy.act(vectors, images, env_ids)
+        arrays["actions"][env_ids] = actions
         for number, vector, action in zip(numbers, vectors, actions, strict=True):
             recordings[number].vectors.append(vector)
             recordings[number].actions.append(action)
@@ -119,7 +120,7 @@ def rollout(
             StepRequest(number, None, need) for number, need in zip(numbers, needs, strict=True)
         ]
 
-    requests, running = start(range(arrays.num_envs)), 0
+    requests, running = start(range(len(arrays))), 0
     while requests or running:
         envs.submit(requests)
         running += len(requests)

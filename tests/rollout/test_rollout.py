@@ -184,8 +184,8 @@ def test_only_what_the_policy_needs_is_rendered(env_config: EnvConfig) -> None:
         truth += [env.step(action)[0] for _ in range(3)]
     for workers in (0, 1):
         with open_envs(seen, 2, workers) as envs:
-            images, number = envs.arrays.images, 1
-            envs.arrays.actions[number] = action
+            images, number = envs.arrays["images"], 1
+            envs.arrays["actions"][number] = action
             requests = [
                 StepRequest(number, 5, True),
                 *[StepRequest(number, None, needed) for needed in (True, False, True)],
@@ -207,11 +207,12 @@ def test_only_what_the_policy_needs_is_rendered(env_config: EnvConfig) -> None:
 def test_a_worker_that_dies_is_an_error_and_not_a_hang(env_config: EnvConfig) -> None:
     class Murderer(Recurrent):
         def act(self, *arguments: Any) -> NDArray[np.float32]:
+            assert isinstance(envs, WorkerEnvs)
             os.kill(envs._workers[1].process.pid, signal.SIGKILL)
             return super().act(*arguments)
 
     with (
-        WorkerEnvs(env_config, 4, 2) as envs,
+        open_envs(env_config, 4, 2) as envs,
         pytest.raises(
             RuntimeError, match=r"worker process of environments 1, 3 died \(exit code -9\)"
         ),
