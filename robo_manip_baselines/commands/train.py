@@ -15,7 +15,7 @@ import tyro
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.registry import policy_names, policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
-from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.metrics import read_metrics
 from robo_manip_baselines.runs.progress import closing_table
@@ -60,14 +60,14 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     values = read_config(file) if file else {}
     if values.setdefault("policy", policy) != policy:
         raise RequestError(f"'{file}' is of policy {values['policy']}, not {policy}")
-    preset = _last_value(args, "preset") or str(values.get("preset", "auto"))
+    preset = last_value(args, "preset") or str(values.get("preset", "auto"))
     if preset == "auto":
         preset = _auto_preset(list(presets), False if is_help else has_gpu, is_quiet=is_help)
     options = TrainCommandOptions(TrainConfig.from_preset(policy, preset))
     options = _with_budget(options, values)
     if file:
         options = _apply_yaml(file, {**values, "preset": preset}, options)
-    budgets = {name: _last_value(args, name) for name in ("epochs", "steps")}
+    budgets = {name: last_value(args, name) for name in ("epochs", "steps")}
     options = _with_budget(options, budgets)
     description = (
         f"Train a policy on demonstrations. Policies: {', '.join(policy_names())}; the options and "
@@ -142,25 +142,11 @@ def _apply_yaml(
 
 def _yaml_file(args: Sequence[str]) -> Path | None:
     """Return the file of defaults: ``--config``, else that of a run folder to resume."""
-    if given := _last_value(args, "config"):
+    if given := last_value(args, "config"):
         return Path(given)
-    out = _last_value(args, "out")
+    out = last_value(args, "out")
     saved = Path(out) / CONFIG if out else None
     return saved if saved and "--resume" in args and saved.is_file() else None
-
-
-def _last_value(args: Sequence[str], name: str) -> str | None:
-    """Return the value after ``--name`` or ``--name=``; None where it is not given."""
-    found: str | None = None
-    for place, arg in enumerate(args):
-        option, sign, value = arg.partition("=")
-        if option != f"--{name}":
-            continue
-        if sign:
-            found = value
-        elif place + 1 < len(args):
-            found = args[place + 1]
-    return found
 
 
 def summary(config: TrainConfig[Any], first_step: int) -> str:

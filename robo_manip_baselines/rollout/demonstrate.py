@@ -32,6 +32,8 @@ from robo_manip_baselines.data import (
 from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
+from robo_manip_baselines.policy.presets import require_at_least
+from robo_manip_baselines.rollout.results import completion_time, require_seeds
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, write_json
 from robo_manip_baselines.runs.versions import software_versions
@@ -137,13 +139,8 @@ class Collection:
         object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
         require_choice("expert", self.expert, task_entry(self.env).experts)
         require_choice("image codec", self.codec, CODECS)
-        if self.seeds.start < 0:
-            raise RequestError(f"seed {self.seeds.start}: must be 0 or more")
-        if len(self.seeds) < 1:
-            count = self.seeds.stop - self.seeds.start
-            raise RequestError(f"num_episodes {count}: must be 1 or more")
-        if self.workers < 1:
-            raise RequestError(f"workers {self.workers}: must be at least 1")
+        require_seeds(self.seeds)
+        require_at_least(1, self, "workers")
         if not 1 <= self.quality <= 100:
             raise RequestError(f"image quality {self.quality}: must be 1 to 100")
 
@@ -206,11 +203,8 @@ def collect(collection: Collection) -> CollectionSummary:
         done = finished_seeds(collection.out)
         todo = [seed for seed in collection.seeds if seed not in done]
         if len(todo) < len(collection.seeds):
-            logger.info(
-                "%d of %d episodes are there already",
-                len(collection.seeds) - len(todo),
-                len(collection.seeds),
-            )
+            total = len(collection.seeds)
+            logger.info("%d of %d episodes are there already", total - len(todo), total)
         steps, begin = 0, time.perf_counter()
         with tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress:
             for count in _record_all(collection, env, todo):
@@ -234,19 +228,14 @@ def _summarize(
     collection: Collection, steps: int, steps_per_second: float | None
 ) -> CollectionSummary:
     """Summarize the files of a collection."""
-    outcomes = {
-        seed: read_metadata(path) for seed in collection.seeds if (path := collection.path(seed))
-    }
+    paths = {seed: collection.path(seed) for seed in collection.seeds}
+    outcomes = {seed: read_metadata(path) for seed, path in paths.items() if path}
     times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
+    mean, sd = completion_time(times)
+    strict = sum(bool(o["is_success_strict"]) for o in outcomes.values())
+    failed = [seed for seed, o in outcomes.items() if not o["is_success"]]
     return CollectionSummary(
-        episodes=len(outcomes),
-        successes=len(times),
-        strict_successes=sum(bool(o["is_success_strict"]) for o in outcomes.values()),
-        failed_seeds=[seed for seed, o in outcomes.items() if not o["is_success"]],
-        completion_time_mean=float(np.mean(times)) if times else None,
-        completion_time_sd=float(np.std(times, ddof=1)) if len(times) > 1 else None,
-        steps=steps,
-        steps_per_second=steps_per_second,
+        len(outcomes), len(times), strict, failed, mean, sd, steps, steps_per_second
     )
 
 
@@ -320,10 +309,8 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     Raises:
         RequestError: naming the first setting that differs.
     """
-    if not collection.out.is_dir():
-        return
-    paths = (collection.path(seed) for seed in sorted(finished_seeds(collection.out)))
-    present = next((path for path in paths if path), None)
+    done = sorted(finished_seeds(collection.out))
+    present = next((path for seed in done if (path := collection.path(seed))), None)
     if present is None:
         return
     there = read_metadata(present)
