@@ -60,10 +60,11 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     values = read_config(file) if file else {}
     if values.setdefault("policy", policy) != policy:
         raise RequestError(f"'{file}' is of policy {values['policy']}, not {policy}")
+    env = last_value(args, "env") or str(values.get("env", TrainConfig.env))
     preset = last_value(args, "preset") or str(values.get("preset", "auto"))
     if preset == "auto":
         preset = _auto_preset(list(presets), False if is_help else has_gpu, is_quiet=is_help)
-    options = TrainCommandOptions(TrainConfig.from_preset(policy, preset))
+    options = TrainCommandOptions(TrainConfig.from_preset(policy, preset, env))
     options = _with_budget(options, values)
     if file:
         options = _apply_yaml(file, {**values, "preset": preset}, options)
