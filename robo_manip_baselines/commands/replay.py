@@ -32,7 +32,7 @@ def replay_episodes(options: ReplayOptions) -> int:
     """
     # Imported here: --help needs no simulator.
     from robo_manip_baselines.data import list_episodes
-    from robo_manip_baselines.rollout.replay import deviation
+    from robo_manip_baselines.rollout.demonstrate import deviation
     from robo_manip_baselines.rollout.videos import write_preview
 
     paths = [

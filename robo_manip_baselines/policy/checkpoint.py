@@ -112,7 +112,9 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     try:
         return Checkpoint(
             folder=folder,
-            config=load_part(policy_entry(config["policy"]).config)(**with_tuples(config["config"])),
+            config=load_part(policy_entry(config["policy"]).config)(
+                **with_tuples(config["config"])
+            ),
             dims=PolicyDims(**with_tuples(config["sizes"])),
             spec=ObservationSpec.from_json(config["spec"]),
             execution=ActionExecution.from_json(config["acting"]),

@@ -22,7 +22,7 @@ from robo_manip_baselines.data import EpisodeReader, read_metadata
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, FaceEnv, world_of
 from robo_manip_baselines.observation import CAMERAS
-from robo_manip_baselines.rollout.replay import remake_env, replay
+from robo_manip_baselines.rollout.demonstrate import remake_env, replay
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
 from robo_manip_baselines.rollout.workers import EnvConfig

@@ -29,6 +29,7 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import MetricsLog, open_board
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.runs.versions import software_versions
+from robo_manip_baselines.training.batching import ExampleSampler
 from robo_manip_baselines.training.config import (
     CONFIG,
     METRICS,
@@ -36,7 +37,6 @@ from robo_manip_baselines.training.config import (
     require_same_config,
     write_config,
 )
-from robo_manip_baselines.training.sampling import ExampleSampler
 
 
 @dataclass(frozen=True)

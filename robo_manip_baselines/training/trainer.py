@@ -1,4 +1,4 @@
-"""The training loop."""
+"""The training loop, and the loss on the episodes held out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import derive_seed
-from robo_manip_baselines.training.batching import BatchLoader
+from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise
 from robo_manip_baselines.training.config import CURVES, METRICS, TrainConfig
 from robo_manip_baselines.training.device import (
     Processes,
@@ -35,13 +35,17 @@ from robo_manip_baselines.training.device import (
     prepare_device,
 )
 from robo_manip_baselines.training.images import ImageStore, free_memory
-from robo_manip_baselines.training.optim import learning_rate_factor, set_learning_rate
-from robo_manip_baselines.training.sampling import StateNoise
 from robo_manip_baselines.training.setup import TrainSetup
-from robo_manip_baselines.training.state import TrainerState
-from robo_manip_baselines.training.validation import HeldOutLoss
+from robo_manip_baselines.training.state import (
+    TrainerState,
+    learning_rate_factor,
+    set_learning_rate,
+)
 
 KEPT_CHECKPOINTS = 2
+
+HELD_OUT_STARTS = 8
+"""Examples of each episode: enough for a smooth curve, little of training's time."""
 
 _STEPS_BETWEEN_VOTES = 10
 """On several GPUs, steps between asking whether any process is to stop: asking waits."""
@@ -301,6 +305,60 @@ class _LossModule(nn.Module):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss and its parts."""
         return self.model.loss(batch)
+
+
+class HeldOutLoss:
+    """Mean loss over fixed examples of the episodes held out.
+
+    Args:
+        setup: of the run; one or more of its episodes are held out.
+        model: its chunk size, observation steps and noise size are read.
+        images: of the demonstrations; None without cameras.
+        device: of the network.
+        autocast: type of autocast, or None.
+    """
+
+    def __init__(
+        self,
+        setup: TrainSetup,
+        model: PolicyModel,
+        images: ImageStore | None,
+        device: torch.device,
+        autocast: torch.dtype | None,
+    ) -> None:
+        seed = derive_seed(setup.config.seed, "validation")
+        given, batch_size = setup.demonstrations, setup.config.training.batch_size
+        episodes = given.indices(setup.split.validation)
+        sampler = ExampleSampler(given.lengths[list(episodes)], "episode", batch_size, seed)
+        self._loader = BatchLoader(
+            *(given, setup.normalization, episodes, sampler, model),
+            seed=seed,
+            device=device,
+            images=images,
+        )
+        self._steps = -(-HELD_OUT_STARTS * len(episodes) // batch_size)
+        self._device, self._autocast = device, autocast
+
+    @torch.no_grad()
+    def __call__(self, model: PolicyModel) -> dict[str, float]:
+        """Return the mean of each part of the loss, every valid step counting the same."""
+        was_training = model.training
+        model.eval()
+        names: list[str] = []
+        sums, weight = torch.zeros((), device=self._device), torch.zeros((), device=self._device)
+        on = self._autocast is not None
+        with (
+            torch.autocast(self._device.type, self._autocast, enabled=on),
+            contextlib.closing(self._loader.batches(0, self._steps)) as batches,
+        ):
+            for batch in batches:
+                parts = model.loss(batch)
+                names = list(parts)
+                values = torch.stack([value.double() for value in parts.values()])
+                sums = sums + values * batch.num_valid
+                weight = weight + batch.num_valid
+        model.train(was_training)
+        return dict(zip(names, (sums / weight).tolist(), strict=True))
 
 
 def _draw_curves(config: TrainConfig[Any]) -> None:
