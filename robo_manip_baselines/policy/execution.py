@@ -9,7 +9,7 @@ Every environment is at a step of its own; its actions depend on its own episode
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,22 +24,6 @@ from robo_manip_baselines.runs.seeds import derive_seed
 
 EnvIds = NDArray[np.intp]
 """(b,) numbers of environments, all different."""
-
-
-class ActionBuffer(Protocol):
-    """Predicted chunks of every environment, from which actions are taken."""
-
-    def reset(self, env_ids: EnvIds) -> None:
-        """Forget the predictions for these environments: new episodes start in them."""
-        ...
-
-    def steps_to_prediction(self, env_ids: EnvIds) -> NDArray[np.intp]:
-        """Return (b,) how many steps each environment can act before it needs a prediction."""
-        ...
-
-    def act(self, env_ids: EnvIds, chunks: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (b, A), given chunks (m, K, A) for those that need one, in order."""
-        ...
 
 
 class TemporalEnsemble:
@@ -126,10 +110,16 @@ class ActionQueue:
         return action
 
 
+ActionBuffer = TemporalEnsemble | ActionQueue
+
+
 def make_action_buffer(
     execution: ActionExecution, num_envs: int, chunk_size: int, action_size: int
 ) -> ActionBuffer:
-    """Build the buffer that the settings ask for.
+    """Build the buffer of predicted chunks that the settings ask for.
+
+    Its ``reset`` starts episodes, ``steps_to_prediction`` counts the steps before an environment
+    needs a prediction, and ``act`` takes chunks for those that need one.
 
     Raises:
         RequestError: more actions would be executed than a chunk has.

@@ -166,10 +166,9 @@ class TrainConfig(Generic[Network]):
         if "image_size" in given:
             given["image_size"] = parse_image_size(given["image_size"])
         is_on = given.pop("corruption", True) is not False  # --no_corruption of older releases
-        corruption = {
-            of: given[name] for name, of in _CORRUPTION.items() if name in given and is_on
-        }
-        given["corruption"] = Corruption(**{k: v for k, v in corruption.items() if v is not None})
+        names = _CORRUPTION.items() if is_on else ()
+        corruption = {of: given[name] for name, of in names if given.get(name) is not None}
+        given["corruption"] = Corruption(**corruption)
 
         def changed(part: Any) -> Any:
             names = {item.name for item in fields(part)} & given.keys()

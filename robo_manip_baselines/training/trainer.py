@@ -103,7 +103,11 @@ def _train(
             if trainer.run(stop) < setup.total_steps:
                 return EXIT_INTERRUPTED
         if processes.is_main:
-            _draw_curves(config)
+            run = config.folder
+            if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
+                logger.info("curves: %s", run / CURVES)
+            else:
+                logger.info("no image of the curves: pip install matplotlib")
     return 0
 
 
@@ -359,11 +363,3 @@ class HeldOutLoss:
                 weight = weight + batch.num_valid
         model.train(was_training)
         return dict(zip(names, (sums / weight).tolist(), strict=True))
-
-
-def _draw_curves(config: TrainConfig[Any]) -> None:
-    run = config.folder
-    if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
-        logger.info("curves: %s", run / CURVES)
-    else:
-        logger.info("no image of the curves: pip install matplotlib")
