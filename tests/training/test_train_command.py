@@ -94,7 +94,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
     process.communicate()
     (step, _), *_ = list_checkpoints(run)
     assert 0 < step < 200, "killed too late"
-    partial = run / "checkpoints" / ".step_00000199.1.partial"
+    partial = run / "checkpoints" / f".step_00000199.{process.pid}.partial"
     partial.mkdir()
     process = start(repository, f"Mlp --out {run} --resume")
     output, errors = process.communicate(timeout=TIMEOUT)

@@ -306,12 +306,9 @@ class CvaeEncoder(nn.Module):
             is_pad: (B, K) bool, actions to mask out.
         """
         batch = state.shape[0]
-        class_token, state_token = (
-            self.class_token.expand(batch, 1, -1),
-            self.state_projection(state),
-        )
-        actions = self.action_projection(action)
-        tokens = torch.cat([class_token, state_token[:, None], actions], dim=1)
+        class_token = self.class_token.expand(batch, 1, -1)
+        parts = class_token, self.state_projection(state)[:, None], self.action_projection(action)
+        tokens = torch.cat(parts, dim=1)
         keep = torch.cat([is_pad.new_ones((batch, 2)), ~is_pad], dim=1)
         encoded = self.encoder(tokens, self.positions, keep)
         mean, log_variance = self.latent_projection(encoded[:, 0]).chunk(2, dim=-1)
