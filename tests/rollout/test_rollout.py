@@ -262,9 +262,9 @@ class Seeing(PolicyModel):
         self, state: torch.Tensor, images: torch.Tensor | None, noise: torch.Tensor | None
     ) -> torch.Tensor:
         assert images is not None
-        seen = images.float().flatten(1) / 255
+        seen = images[:, -1].float().flatten(1) / 255
         weight = torch.linspace(-1, 1, seen.shape[1])
-        glance = (seen * weight).mean(1) + 0.01 * state.sum(1)
+        glance = (seen * weight).mean(1) + 0.01 * state[:, -1].sum(1)
         return glance[:, None, None] * torch.linspace(-1, 1, 28).view(4, 7)
 
 
