@@ -68,8 +68,7 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     options = _with_budget(options, values)
     if file:
         options = _apply_yaml(file, {**values, "preset": preset}, options)
-    budgets = {name: last_value(args, name) for name in ("epochs", "steps")}
-    options = _with_budget(options, budgets)
+    options = _with_budget(options, {n: last_value(args, n) for n in ("epochs", "steps")})
     description = (
         f"Train a policy on demonstrations. Policies: {', '.join(policy_names())}; the options and "
         f"defaults below are those of {policy} with --preset {preset}. Presets of {policy}: "
@@ -151,12 +150,7 @@ def _yaml_file(args: Sequence[str]) -> Path | None:
 
 
 def summary(config: TrainConfig[Any], first_step: int) -> str:
-    """Return the closing table of a run, from its metrics.
-
-    Args:
-        config: of the run.
-        first_step: steps done before this process.
-    """
+    """Return the closing table of a run, from its metrics; ``first_step`` were done before."""
     losses = {"train": "-", "validation": "-"}
     step, seconds = 0, 0.0
     for line in read_metrics(config.folder / METRICS):
@@ -199,8 +193,7 @@ def main(args: Sequence[str]) -> int:
         resume = f"python bin/Train.py {config.policy} --out {out} --resume"
         logger.info("stopped at step %d; continue with: %s", step, resume)
         return code
-    print(summary(config, before[-1][0] if before else 0))  # noqa: T201
-    print(  # noqa: T201
-        f"next: python bin/Rollout.py {config.env} --policy {config.policy} --checkpoint {out}"
-    )
+    evaluate = f"python bin/Rollout.py {config.env} --policy {config.policy} --checkpoint {out}"
+    table = summary(config, before[-1][0] if before else 0)
+    print(f"{table}\nnext: {evaluate}")  # noqa: T201
     return 0

@@ -92,14 +92,14 @@ def demonstrate(
         rows["is_success"].append(info["is_success"])
         rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated
-    completion_time = info["completion_time"]
+    time = info["completion_time"]
     attributes = {
         "env_id": env.spec.id,
         "env_kwargs": dict(env.spec.kwargs),
         **start,
         "is_success": info["is_success"],
         "is_success_strict": info["is_success_strict"],
-        "completion_time": np.nan if completion_time is None else completion_time,
+        "completion_time": np.nan if time is None else time,
         "versions": software_versions("mujoco", "numpy", "robo_manip_baselines"),
         "seed": seed,
         "expert": expert,
@@ -151,11 +151,7 @@ class Collection:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Collection:
-        """Return the collection that ``to_json`` was called on.
-
-        Raises:
-            RequestError: a value is not valid.
-        """
+        """Return the collection that ``to_json`` was called on."""
         return cls(**{**values, "out": Path(values["out"]), "seeds": range(*values["seeds"])})
 
     def path(self, seed: int) -> Path | None:
@@ -371,12 +367,7 @@ def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any
 
 
 def replay(env: gymnasium.Env[Any, Any], episode: EpisodeReader) -> Iterator[int]:
-    """Replay an episode; yield each step's index while the environment is as it was before it.
-
-    Args:
-        env: from `remake_env`.
-        episode: open file.
-    """
+    """Replay an episode in an environment from `remake_env`, as before each step yielded."""
     env.reset(seed=int(episode.attributes["seed"]))
     for step, action in enumerate(episode.array("action")):
         yield step

@@ -283,11 +283,7 @@ class EvaluationPlan:
 
 
 def evaluate(config: EvaluationConfig) -> EvaluationSummary:
-    """Evaluate a checkpoint: run the episodes that its folder lacks, summarize, write videos.
-
-    Raises:
-        RequestError: the request cannot be met.
-    """
+    """Evaluate a checkpoint, see `EvaluationPlan.of` and `run_plan`; return the summary."""
     return run_plan(EvaluationPlan.of(config))[0]
 
 

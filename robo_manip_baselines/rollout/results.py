@@ -378,20 +378,13 @@ def completion_time(times: Sequence[float]) -> tuple[float | None, float | None]
 
 def summary_table(task: TaskEntry, summary: EvaluationSummary, facts: dict[str, str]) -> str:
     """Lay out the closing table; ``facts`` are further rows at its end."""
-    total, limit = summary.episodes, summary.success_within_limit
     failures = [f"{kind} {count}" for kind, count in summary.failures.items() if count]
-    rate = summary.episodes_per_second
-
-    def proportion(part: Proportion) -> str:
-        return f"{part.count}/{total}  {part}"
-
-    rows = {
-        "episodes": str(total),
-        "success": proportion(summary.success),
-        "strict success": proportion(summary.strict_success),
-    }
-    if limit:
-        rows[f"success in {task.success_time_limit:g} s"] = proportion(limit)
+    total, rate = summary.episodes, summary.episodes_per_second
+    proportions = {"success": summary.success, "strict success": summary.strict_success}
+    if summary.success_within_limit:
+        proportions[f"success in {task.success_time_limit:g} s"] = summary.success_within_limit
+    rows = {"episodes": str(total)}
+    rows |= {name: f"{part.count}/{total}  {part}" for name, part in proportions.items()}
     rows["completion time"] = mean_and_sd(summary.completion_time_mean, summary.completion_time_sd)
     for name, values in summary.columns.items():
         label = name.replace("_", " ")
@@ -408,4 +401,4 @@ def mean_and_sd(mean: float | None, sd: float | None) -> str:
     """Format a mean time with its standard deviation: ``5.69 ± 0.96 s``."""
     if mean is None:
         return "-"
-    return f"{mean:.2f}" + (f" ± {sd:.2f} s" if sd is not None else " s")
+    return f"{mean:.2f} s" if sd is None else f"{mean:.2f} ± {sd:.2f} s"

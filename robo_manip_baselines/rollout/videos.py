@@ -125,11 +125,7 @@ def pad_to_even(image: np.ndarray) -> np.ndarray:
 
 
 def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Join images of any sizes in a row, each scaled to the height of the first.
-
-    Returns:
-        (H, sum of widths, 3) uint8.
-    """
+    """Join images in a row, (H, sum of widths, 3), each scaled to the height of the first."""
     if not images:
         raise ValueError("no image to put side by side")
     height, row = images[0].shape[0], []
@@ -159,9 +155,6 @@ def draw_track(
         colour: RGB.
         thickness: of the line, in pixels.
         radius: of the ring, in pixels.
-
-    Returns:
-        A new image.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     # Far outside the image a line is cut off unseen; OpenCV's fixed-point numbers overflow.
@@ -175,7 +168,7 @@ def draw_track(
             _add_line(opacity, fixed[index - 1], fixed[index], thickness, value)
     drawn = _paint(image, opacity, colour)
     if len(points) and valid[-1]:
-        centre = (int(fixed[-1][0]), int(fixed[-1][1]))
+        centre = fixed[-1].tolist()
         # The dark rim lies outside only: what is in the ring stays to be seen.
         rim = radius * 16 + 8 * thickness + 8
         cv2.circle(drawn, centre, rim, BLACK, 1, cv2.LINE_AA, shift=4)
@@ -184,14 +177,9 @@ def draw_track(
 
 
 def put_caption(image: np.ndarray, text: str) -> np.ndarray:
-    """Write one line at the lower left, white with a dark rim, sized to the image.
-
-    Returns:
-        A new image.
-    """
-    height, width = image.shape[:2]
+    """Write one line at the lower left, white with a dark rim, sized to the image."""
+    (height, width), font = image.shape[:2], cv2.FONT_HERSHEY_SIMPLEX
     scale = max(height / 700, 0.35)
-    font = cv2.FONT_HERSHEY_SIMPLEX
     margin = round(12 * scale) + 4
     text_width = cv2.getTextSize(text, font, scale, 1)[0][0]
     if text_width > width - 2 * margin > 0:
@@ -224,19 +212,13 @@ def _add_line(
         return
     region = opacity[low[1] : high[1], low[0] : high[0]]
     line = np.zeros_like(region)
-    shift = low * 16
-    first = (int(start[0] - shift[0]), int(start[1] - shift[1]))
-    last = (int(end[0] - shift[0]), int(end[1] - shift[1]))
+    first, last = (start - low * 16).tolist(), (end - low * 16).tolist()
     cv2.line(line, first, last, value, thickness, cv2.LINE_AA, shift=4)
     np.maximum(region, line, out=region)
 
 
 def write_preview(path: Path, episodes: Sequence[Path]) -> None:
     """Write one H.264 video of some episodes, one after the other, with a progress bar.
-
-    Args:
-        path: of the video, ``....mp4``.
-        episodes: files.
 
     Raises:
         RequestError: an episode is damaged or of another model, or there is no OpenGL.
@@ -288,13 +270,7 @@ def video_name(result: EpisodeResult) -> str:
 
 
 def write_video(path: Path, config: EnvConfig, result: EpisodeResult, recording: Recording) -> None:
-    """Write an H.264 video of an episode.
-
-    Args:
-        path: of the video, ``....mp4``.
-        config: of the environment in which the policy acted.
-        result: of the episode.
-        recording: its observations and actions.
+    """Write an H.264 video of an episode of a policy, in the environment in which it acted.
 
     Raises:
         RequestError: there is no OpenGL.

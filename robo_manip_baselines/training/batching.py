@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import fields
 
 import numpy as np
 import torch
@@ -98,8 +97,7 @@ class ExampleSampler:
 
     def _epoch(self, epoch: int) -> Indices:
         """Return all examples of an epoch in their order; two epochs are cached."""
-        cached = self._epochs.get(epoch)
-        if cached is not None:
+        if (cached := self._epochs.get(epoch)) is not None:
             return cached
         rng = np.random.default_rng(derive_seed(self.seed, "schedule", epoch))
         if self.sampler == "episode":
@@ -299,12 +297,11 @@ class BatchLoader:
         chunks, is_pad = chunk_rows(self._offsets, episodes, starts, self._model.chunk_size)
         windows = window_rows(self._offsets, episodes, starts, n_obs_steps)
         noise = step_noise(self._seed, "noise", step, count, self._model.noise_size)
+        part = part_of(count, self._rank, self._world_size)
         state_noise: Tensor | None = None
         if self._state_noise:
-            state_noise = self._state_noise.draw(self._seed, step, count * n_obs_steps)
-        part = part_of(count, self._rank, self._world_size)
-        if state_noise is not None:
-            state_noise = state_noise.view(count, n_obs_steps, -1)[part]
+            drawn = self._state_noise.draw(self._seed, step, count * n_obs_steps)
+            state_noise = None if drawn is None else drawn.view(count, n_obs_steps, -1)[part]
         gather = self._gather if self._stream is None else self._gather_on_device
         # All processes divide by the same number, the mean over the processes.
         return gather(
@@ -396,8 +393,7 @@ def _received(batch: Batch, ready: torch.cuda.Event | None) -> Batch:
     if ready is not None:
         stream = torch.cuda.current_stream(batch.state.device)
         stream.wait_event(ready)
-        for field in fields(batch):
-            tensor = getattr(batch, field.name)
+        for tensor in vars(batch).values():
             if tensor is not None:
                 # Allocated on another stream: it must not be reused before this one is done.
                 tensor.record_stream(stream)

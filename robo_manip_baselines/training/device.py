@@ -170,8 +170,7 @@ class Processes:
         Raises:
             RequestError: it is set in part only.
         """
-        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
-        values = [os.environ.get(name) for name in names]
+        values = [os.environ.get(name) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK")]
         if values[0] is None and values[1] in (None, "1"):
             return cls()
         if None in values or "MASTER_ADDR" not in os.environ:

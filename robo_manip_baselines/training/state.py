@@ -27,13 +27,9 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 def make_optimizer(model: PolicyModel, settings: TrainSettings) -> torch.optim.AdamW:
     """Make AdamW over the policy's parameter groups, fused where the device has it."""
-    fused = next(model.parameters()).device.type in ("cpu", "cuda")
-    optimizer = torch.optim.AdamW(
-        model.parameter_groups(settings.learning_rate),  # pyright: ignore[reportArgumentType]
-        lr=settings.learning_rate,
-        weight_decay=settings.weight_decay,
-        fused=fused,
-    )
+    fused, rate = next(model.parameters()).device.type in ("cpu", "cuda"), settings.learning_rate
+    groups: Any = model.parameter_groups(rate)
+    optimizer = torch.optim.AdamW(groups, lr=rate, weight_decay=settings.weight_decay, fused=fused)
     for group in optimizer.param_groups:
         group["initial_lr"] = group["lr"]
     return optimizer
@@ -72,18 +68,14 @@ class WeightAverage:
 
     def __init__(self, model: PolicyModel, decay: float) -> None:
         self.model = copy.deepcopy(model).eval().requires_grad_(False)
-        self._decay = decay
-        self._averages: list[Tensor] = list(self.model.parameters())
-        self._weights: list[Tensor] = list(model.parameters())
-        self._source = model
+        self._decay, self._source = decay, model
 
     @torch.no_grad()
     def update(self, step: int) -> None:
         """Include the weights after a step; no host synchronisation."""
         decay = min(self._decay, (1 + step) / (10 + step))
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            self._averages, self._weights, 1.0 - decay
-        )
+        averages, weights = list(self.model.parameters()), list(self._source.parameters())
+        torch._foreach_lerp_(averages, weights, 1.0 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
     @torch.no_grad()
     def copy_buffers(self) -> None:
@@ -195,23 +187,19 @@ class TrainerState:
         tensors, json = read_trainer(checkpoint)
         if self.average:
             self.average.model.load_state_dict(weights)
-            weights = {
-                name.removeprefix("weights/"): tensor
-                for name, tensor in tensors.items()
-                if name.startswith("weights/")
-            }
+            prefix = "weights/"
+            weights = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
         self.model.load_state_dict(weights)
         fused = bool(self.optimizer.defaults["fused"])
         for name, parameter in self._named():
             if name not in json["optimizer_steps"]:
                 continue
-            # In the memory layout of the parameter, as AdamW itself makes them.
-            moments = {
-                m: torch.empty_like(parameter).copy_(tensors[f"{m}/{name}"]) for m in _MOMENTS
-            }
             device = parameter.device if fused else "cpu"
             count = torch.tensor(float(json["optimizer_steps"][name]), device=device)
-            self.optimizer.state[parameter] = {"step": count, **moments}
+            self.optimizer.state[parameter] = {"step": count}
+            for moment in _MOMENTS:  # in the memory layout of the parameter, as AdamW makes them
+                value = torch.empty_like(parameter).copy_(tensors[f"{moment}/{name}"])
+                self.optimizer.state[parameter][moment] = value
         self.losses.names = tuple(json["metrics"]["names"])
         self.losses.count = json["metrics"]["count"]
         if self.losses.count:
