@@ -176,14 +176,11 @@ def write_checkpoint(
     """Write a checkpoint folder, whole or not at all.
 
     Args:
-        folder: name of the folder, which must not exist yet.
-        checkpoint: description of the network; its ``folder`` and ``content_hash`` are not read.
+        folder: must not exist yet.
+        checkpoint: description of the network; returned with this ``folder`` and its hash.
         model_state: the state dict for evaluation.
         trainer_tensors: tensors for resuming, flat names.
         trainer: numbers for resuming, for JSON.
-
-    Returns:
-        The checkpoint, with its folder and hash.
     """
     import safetensors.torch
 

@@ -31,13 +31,8 @@ class TemporalEnsemble:
 
     The i-th prediction for a step, the oldest being i = 0, has the weight exp(-decay i); weights
     are divided by their sum (public ACT: decay 0.01). Predictions are counted, so a prediction of
-    zero is one like any other. Only sums for the K steps ahead are kept, and no chunk.
-
-    Args:
-        num_envs: n.
-        chunk_size: K.
-        action_size: A.
-        decay: of the weights; more than 0 trusts old predictions more, less than 0 new ones.
+    zero is one like any other. Only sums for the K steps ahead are kept, and no chunk. A decay of
+    more than 0 trusts old predictions more, less than 0 new ones.
     """
 
     def __init__(
@@ -51,8 +46,7 @@ class TemporalEnsemble:
 
     def reset(self, env_ids: EnvIds) -> None:
         """Forget the predictions for these environments."""
-        self._sum[env_ids] = 0.0
-        self._count[env_ids] = 0
+        self._sum[env_ids], self._count[env_ids] = 0.0, 0
 
     def steps_to_prediction(self, env_ids: EnvIds) -> NDArray[np.intp]:
         """Return zeros: a prediction is needed at every step."""
@@ -70,13 +64,7 @@ class TemporalEnsemble:
 
 
 class ActionQueue:
-    """The first actions of each chunk, executed before the next chunk is predicted.
-
-    Args:
-        num_envs: n.
-        chunk_size: K.
-        action_size: A.
-        n_action_steps: actions of a chunk that are executed, 1 to K.
+    """The first ``n_action_steps`` of each chunk, executed before the next chunk is predicted.
 
     Raises:
         RequestError: ``n_action_steps`` is not 1 to K.
@@ -147,7 +135,7 @@ class PolicyRunner:
         model: the network; it is moved to the device and put into evaluation mode.
         spec: of the observations.
         normalization: of the demonstrations that it was trained on.
-        execution: execution of its chunks.
+        execution: of its chunks.
         num_envs: n.
         device: of the network.
         precision: ``fp32``, or ``bf16`` for the products inside the network.

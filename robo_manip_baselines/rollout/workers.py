@@ -87,10 +87,7 @@ class EnvConfig:
         )
 
     def make(self, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """Make the environment.
-
-        Args:
-            **changes: arguments that shall differ.
+        """Make the environment, with changes to its arguments.
 
         Raises:
             RequestError: an argument is not valid.
@@ -204,13 +201,7 @@ class _Worker:
 
 
 class WorkerEnvs:
-    """Environments dealt out to worker processes.
-
-    Args:
-        config: of every environment.
-        num_envs: n.
-        workers: processes.
-    """
+    """Environments dealt out to worker processes."""
 
     def __init__(self, config: EnvConfig, num_envs: int, workers: int) -> None:
         self.config = config

@@ -153,13 +153,8 @@ def step_noise(seed: int, stream: str, step: int, count: int, size: int) -> Tens
 class StateNoise:
     """Gaussian noise on normalised states: on proprioception and on the clock.
 
-    Mouth and cube are left as they are.
-
-    Args:
-        spec: of the observations.
-        names: of the task's target and objects.
-        robot: ``TrainSettings.state_noise``.
-        clock: ``TrainSettings.clock_noise``.
+    Mouth and cube are left as they are. ``robot`` is ``TrainSettings.state_noise``, ``clock``
+    ``TrainSettings.clock_noise``.
     """
 
     def __init__(

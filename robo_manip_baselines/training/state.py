@@ -69,13 +69,13 @@ class WeightAverage:
     def __init__(self, model: PolicyModel, decay: float) -> None:
         self.model = copy.deepcopy(model).eval().requires_grad_(False)
         self._decay, self._source = decay, model
+        self._pairs = list(self.model.parameters()), list(model.parameters())
 
     @torch.no_grad()
     def update(self, step: int) -> None:
         """Include the weights after a step; no host synchronisation."""
         decay = min(self._decay, (1 + step) / (10 + step))
-        averages, weights = list(self.model.parameters()), list(self._source.parameters())
-        torch._foreach_lerp_(averages, weights, 1.0 - decay)  # pyright: ignore[reportPrivateImportUsage]
+        torch._foreach_lerp_(*self._pairs, 1.0 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
     @torch.no_grad()
     def copy_buffers(self) -> None:
@@ -120,12 +120,8 @@ class RunningMean:
 class TrainerState:
     """Everything that a training step changes.
 
-    Args:
-        model: on its device already; changed by training.
-        settings: of the optimiser and the average.
-
     Attributes:
-        model: the trained network.
+        model: the trained network, on its device already when given.
         optimizer: AdamW.
         average: moving average of the weights, or None.
         losses: means since they were last written.
@@ -155,9 +151,7 @@ class TrainerState:
     def state_dict(self, step: int, seconds: float) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return what `restore` needs beside the evaluated weights, as tensors and as JSON.
 
-        Args:
-            step: optimiser steps done.
-            seconds: spent on them.
+        The optimiser has done ``step`` steps in so many seconds.
         """
         tensors: dict[str, Tensor] = {}
         if self.average:
@@ -175,10 +169,7 @@ class TrainerState:
 
     @torch.no_grad()
     def restore(self, checkpoint: Checkpoint) -> float:
-        """Restore the state of a checkpoint of the same network and settings.
-
-        Returns:
-            Seconds spent until then.
+        """Restore a checkpoint of the same network and settings; return the seconds spent so far.
 
         Raises:
             RequestError: the checkpoint lacks the trainer's state, or it is damaged.

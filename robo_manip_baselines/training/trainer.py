@@ -143,35 +143,30 @@ class Trainer:
         images: ImageStore | None = None,
         log: MetricsLog | None = None,
     ) -> None:
-        config, given = setup.config, setup.demonstrations
-        settings = config.training
+        config, given, settings = setup.config, setup.demonstrations, setup.config.training
         self._setup, self._device, self._processes, self._log = setup, device, processes, log
         self._autocast = autocast_type(settings.precision, device, bool(given.spec.cameras))
         model = setup.make_model(initial_weights=start is None).to(device)
         self.state = TrainerState(model, settings)
         seconds = self.state.restore(start) if start else 0.0
         self._saved_step = start.step if start else 0
-        self._progress = StepProgress(
-            *(setup.total_steps, self._saved_step, seconds),
-            shown=processes.is_main,
-            log_every=config.log_every,
-        )
+        done = setup.total_steps, self._saved_step, seconds
+        self._progress = StepProgress(*done, shown=processes.is_main, log_every=config.log_every)
         self._timer = StepTimer(device)
         loss: nn.Module = _LossModule(model)
         if processes.world_size > 1:
             loss = DistributedDataParallel(loss, gradient_as_bucket_view=True)
         self._compute_loss = torch.compile(loss) if settings.compile else loss
+        names = task_entry(config.env).names
+        noise = StateNoise(given.spec, names, settings.state_noise, settings.clock_noise)
+        episodes = given.indices(setup.split.train)
         self.loader = BatchLoader(
-            *(given, setup.normalization, given.indices(setup.split.train), setup.sampler, model),
+            *(given, setup.normalization, episodes, setup.sampler, model),
             seed=config.seed,
             device=device,
             rank=processes.rank,
             world_size=processes.world_size,
-            state_noise=StateNoise(
-                *(given.spec, task_entry(config.env).names),
-                robot=settings.state_noise,
-                clock=settings.clock_noise,
-            ),
+            state_noise=noise,
             images=images,
         )
         self.held_out: HeldOutLoss | None = None
@@ -312,14 +307,10 @@ class _LossModule(nn.Module):
 
 
 class HeldOutLoss:
-    """Mean loss over fixed examples of the episodes held out.
+    """Mean loss over fixed examples of the episodes held out, always with the same noise.
 
-    Args:
-        setup: of the run; one or more of its episodes are held out.
-        model: its chunk size, observation steps and noise size are read.
-        images: of the demonstrations; None without cameras.
-        device: of the network.
-        autocast: type of autocast, or None.
+    Of ``model`` the chunk size, observation steps and noise size are read; ``images`` are None
+    without cameras, ``autocast`` in fp32.
     """
 
     def __init__(
@@ -334,12 +325,8 @@ class HeldOutLoss:
         given, batch_size = setup.demonstrations, setup.config.training.batch_size
         episodes = given.indices(setup.split.validation)
         sampler = ExampleSampler(given.lengths[list(episodes)], "episode", batch_size, seed)
-        self._loader = BatchLoader(
-            *(given, setup.normalization, episodes, sampler, model),
-            seed=seed,
-            device=device,
-            images=images,
-        )
+        data = given, setup.normalization, episodes, sampler, model
+        self._loader = BatchLoader(*data, seed=seed, device=device, images=images)
         self._steps = -(-HELD_OUT_STARTS * len(episodes) // batch_size)
         self._device, self._autocast = device, autocast
 
@@ -350,11 +337,8 @@ class HeldOutLoss:
         model.eval()
         names: list[str] = []
         sums, weight = torch.zeros((), device=self._device), torch.zeros((), device=self._device)
-        on = self._autocast is not None
-        with (
-            torch.autocast(self._device.type, self._autocast, enabled=on),
-            contextlib.closing(self._loader.batches(0, self._steps)) as batches,
-        ):
+        autocast = torch.autocast(self._device.type, self._autocast, enabled=bool(self._autocast))
+        with autocast, contextlib.closing(self._loader.batches(0, self._steps)) as batches:
             for batch in batches:
                 parts = model.loss(batch)
                 names = list(parts)
