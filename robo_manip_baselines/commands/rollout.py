@@ -247,11 +247,7 @@ def record(options: RolloutOptions) -> None:
 
 
 def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> EvaluationConfig:
-    """Return the evaluation that the options of --policy ask for.
-
-    Args:
-        options: parsed with the spec of the checkpoint as defaults.
-        checkpoint: that they name.
+    """Return the evaluation that the options of --policy ask for, given the checkpoint they name.
 
     Raises:
         RequestError: a value is not valid, or differs from the checkpoint where it may not.
@@ -300,10 +296,9 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
 
 
 def _as_typed(value: object) -> str:
-    if isinstance(value, tuple):
-        is_size = bool(value) and isinstance(value[0], int)
-        return ("x" if is_size else ",").join(map(str, value)) or "none"
-    return str(value)
+    if not isinstance(value, tuple):
+        return str(value)
+    return ("x" if value and isinstance(value[0], int) else ",").join(map(str, value)) or "none"
 
 
 # -- command line ---------------------------------------------------------------------------------

@@ -336,14 +336,7 @@ class EvaluationSummary:
 def summarize(
     task: TaskEntry, results: Sequence[EpisodeResult], *, new: int, seconds: float
 ) -> EvaluationSummary:
-    """Summarize the results of all episodes.
-
-    Args:
-        task: that they are of.
-        results: of all episodes.
-        new: number of them that this run made.
-        seconds: of this run.
-    """
+    """Summarize the results of all episodes, of which this run made ``new`` in ``seconds``."""
     total, limit = len(results), task.success_time_limit
     times = [r.completion_time for r in results if r.completion_time is not None]
     mean, sd = completion_time(times)
