@@ -336,12 +336,11 @@ def main(args: Sequence[str]) -> None:
     if options.scripted:
         record(options)
         return
-    evaluation = to_evaluation(options, checkpoint)
-    from robo_manip_baselines.rollout.evaluation import EvaluationPlan, run_plan
+    config = to_evaluation(options, checkpoint)
+    from robo_manip_baselines.rollout.evaluation import evaluate
     from robo_manip_baselines.rollout.results import summary_table
 
-    plan = EvaluationPlan.of(evaluation)
-    summary, videos = run_plan(plan)
+    plan, summary, videos = evaluate(config)
     names = ", ".join(str(path.relative_to(plan.out)) for path in videos)
     facts = {"written to": str(plan.out), "videos": names or "-"}
     print(summary_table(plan.env.task, summary, facts))  # noqa: T201

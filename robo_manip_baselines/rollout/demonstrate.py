@@ -257,9 +257,8 @@ def _record_all(
 
 def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> int:
     """Record one episode into its file; return its number of steps."""
-    demonstration = demonstrate(
-        env, collection.expert, seed, codec=collection.codec, quality=collection.quality
-    )
+    codec, quality = collection.codec, collection.quality
+    demonstration = demonstrate(env, collection.expert, seed, codec=codec, quality=quality)
     path = episode_path(collection.out, seed, demonstration.attributes["is_success"])
     write_episode(path, *demonstration)
     return len(demonstration.arrays["time"])

@@ -282,22 +282,18 @@ class EvaluationPlan:
             torch.set_num_threads(before)
 
 
-def evaluate(config: EvaluationConfig) -> EvaluationSummary:
-    """Evaluate a checkpoint, see `EvaluationPlan.of` and `run_plan`; return the summary."""
-    return run_plan(EvaluationPlan.of(config))[0]
-
-
-def run_plan(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
-    """Run the episodes that the folder of an evaluation lacks; write summary and videos.
+def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummary, list[Path]]:
+    """Evaluate a checkpoint: run the episodes that its folder lacks, write summary and videos.
 
     Returns:
-        The summary, and the files of all videos.
+        The plan that was carried out, the summary, and the files of all videos.
 
     Raises:
         RequestError: the folder holds other results, or the request cannot be met.
     """
+    plan = EvaluationPlan.of(config)
     logger.info("%s", plan)
-    seeds, number, split = plan.config.seeds, plan.config.videos, plan.checkpoint.split
+    seeds, number, split = config.seeds, config.videos, plan.checkpoint.split
     if known := sorted(set(seeds) & {*split.train, *split.validation}):
         logger.warning(
             "%d of the seeds are also seeds of the demonstrations (the first is %d); results on "
@@ -333,7 +329,7 @@ def run_plan(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
     plan.run(again, lambda result, recording: recordings.update({result.seed: recording}))
     for path, result in missing.items():
         write_video(path, plan.env, result, recordings[result.seed])
-    return summary, list(videos)
+    return plan, summary, list(videos)
 
 
 def choose_execution(

@@ -77,14 +77,10 @@ class EnvConfig:
         ``vectors`` (S,) float32 is the packed observation, ``actions`` (A,) float32 the next
         action, ``images`` (N, H, W, 3) uint8.
         """
-        image_shape = (len(self.spec.cameras), *self.spec.image_size, 3)
-        return np.dtype(
-            [
-                ("vectors", np.float32, (self.vector_size,)),
-                ("actions", np.float32, (self.action_size,)),
-                ("images", np.uint8, image_shape),
-            ]
-        )
+        vectors = ("vectors", np.float32, (self.vector_size,))
+        actions = ("actions", np.float32, (self.action_size,))
+        images = ("images", np.uint8, (len(self.spec.cameras), *self.spec.image_size, 3))
+        return np.dtype([vectors, actions, images])
 
     def make(self, **changes: Any) -> gymnasium.Env[Any, Any]:
         """Make the environment, with changes to its arguments.

@@ -173,11 +173,10 @@ def load_backbone(backbone: ResNet18 | None, path: str | Path) -> None:
     path = Path(path)
     if backbone is None:
         raise RequestError(f"backbone_weights '{path}' without cameras: leave one of the two out")
-    found = {
-        name: value
-        for name, value in _read(path).items()
-        if not name.startswith(_IGNORED_PREFIX) and not name.endswith(_IGNORED_SUFFIX)
-    }
+    found = _read(path)
+    for name in list(found):
+        if name.startswith(_IGNORED_PREFIX) or name.endswith(_IGNORED_SUFFIX):
+            del found[name]
     wanted = backbone.state_dict()
     for name in sorted(wanted.keys() | found.keys()):
         if name not in found:
