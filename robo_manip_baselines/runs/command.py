@@ -171,7 +171,7 @@ def last_value(args: Sequence[str], name: str) -> str | None:
         What follows the last ``--name`` or ``--name=``; None where there is no value.
     """
     found = None
-    for arg, following in zip(args, [*args[1:], "--"], strict=True):
+    for arg, following in zip(args, [*args, "--"][1:], strict=True):
         option, sign, value = arg.partition("=")
         if option.startswith("--") and option[2:].replace("-", "_") == name:
             found = value if sign else None if following.startswith("--") else following
