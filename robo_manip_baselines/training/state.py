@@ -69,7 +69,9 @@ class WeightAverage:
     def __init__(self, model: PolicyModel, decay: float) -> None:
         self.model = copy.deepcopy(model).eval().requires_grad_(False)
         self._decay, self._source = decay, model
-        self._pairs = list(self.model.parameters()), list(model.parameters())
+        averages: list[Tensor] = list(self.model.parameters())
+        weights: list[Tensor] = list(model.parameters())
+        self._pairs = averages, weights
 
     @torch.no_grad()
     def update(self, step: int) -> None:
