@@ -43,9 +43,7 @@ class TrainCommandOptions(Generic[Network]):
 def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfig[Any]:
     """Read a command line; its preset and its YAML file give the defaults.
 
-    Args:
-        args: without the name of the program.
-        has_gpu: decides the preset ``auto``; if None, PyTorch is asked where that is needed.
+    ``has_gpu`` decides the preset ``auto``; if None, PyTorch is asked where that is needed.
 
     Raises:
         RequestError: one line that names what is wrong and what is valid.
@@ -170,10 +168,7 @@ def summary(config: TrainConfig[Any], first_step: int) -> str:
 
 
 def main(args: Sequence[str]) -> int:
-    """Run ``bin/Train.py``.
-
-    Returns:
-        The exit code: 0, or 130 after an interruption whose state is saved.
+    """Run ``bin/Train.py``; return 0, or 130 after an interruption whose state is saved.
 
     Raises:
         RequestError: the request cannot be met.

@@ -198,10 +198,7 @@ class PolicyRunner:
     ) -> NDArray[np.float32]:
         """Return the next actions (b, A) in the units of the environment.
 
-        Args:
-            vectors: (b, S) packed observations.
-            images: (b, N, H, W, 3); rows that are not needed may hold anything.
-            env_ids: (b,) the environments that they come from.
+        ``vectors`` are (b, S) packed observations, ``images`` (b, N, H, W, 3).
 
         Raises:
             RequestError: the network gives numbers that are not finite.

@@ -61,14 +61,10 @@ class Demonstration(NamedTuple):
 def demonstrate(
     env: gymnasium.Env[Any, Any], expert: str, seed: int, *, codec: str, quality: int
 ) -> Demonstration:
-    """Let an expert act through one episode.
+    """Let an expert, a name in the task's entry, act through one episode.
 
-    Args:
-        env: made by `make_env`; its cameras are recorded.
-        expert: name in the task's entry.
-        seed: of the episode.
-        codec: see `encode_image`.
-        quality: of JPEG, 1 to 100.
+    The cameras of ``env``, made by `make_env`, are recorded; ``codec`` and ``quality`` are those of
+    `encode_image`.
     """
     if env.spec is None:
         raise ValueError("the environment must be made by its id, so that it can be made again")

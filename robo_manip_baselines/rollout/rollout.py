@@ -37,10 +37,8 @@ class ActingPolicy(Protocol):
     ) -> NDArray[np.float32]:
         """Return the next actions (b, A), each from its own row of the observations alone.
 
-        Args:
-            vectors: (b, S) packed observations.
-            images: (b, N, H, W, 3); None without cameras. Rows that need none may hold anything.
-            env_ids: (b,) environments that they come from.
+        ``vectors`` are (b, S) packed observations, ``images`` (b, N, H, W, 3), None without
+        cameras; rows that need none may hold anything.
         """
         ...
 

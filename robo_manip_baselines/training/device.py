@@ -22,9 +22,7 @@ DEVICE_TYPES = ("cpu", "cuda")
 def choose_device(given: str, local_rank: int = 0) -> torch.device:
     """Return the device of ``--device``; ``auto`` is a GPU where there is one.
 
-    Args:
-        given: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``.
-        local_rank: number of this process on its machine, which is the number of its GPU.
+    ``local_rank``, the number of this process on its machine, is the number of its GPU.
 
     Raises:
         RequestError: there is no such device.

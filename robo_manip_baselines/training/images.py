@@ -87,11 +87,7 @@ class ImageStore(AbstractContextManager["ImageStore"]):
         self.close()
 
     def images(self, rows: NDArray[np.int64], out: Images | None = None) -> Images:
-        """Return the images (b, N, H, W, 3) of (b,) steps.
-
-        Args:
-            rows: places among the R steps of the demonstrations.
-            out: array to write them to.
+        """Return the images (b, N, H, W, 3) of (b,) rows among the R steps, written to ``out``.
 
         Raises:
             IndexError: there is no such step.

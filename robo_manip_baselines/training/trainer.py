@@ -59,12 +59,8 @@ def train(config: TrainConfig[Any], *, resume: bool = False) -> int:
     Writes the run folder, ``config.folder``: options, checkpoints, metrics and their curves. Under
     ``torchrun`` every process calls this.
 
-    Args:
-        config: of the run.
-        resume: continue the run in the run folder, if there is one.
-
-    Returns:
-        The exit code: 0, or 130 after an interruption whose state is saved.
+    Returns the exit code: 0, or 130 after an interruption whose state is saved. With ``resume`` the
+    run in the run folder, if there is one, is continued.
 
     Raises:
         RequestError: the configuration does not fit the demonstrations, the machine or the run

@@ -300,10 +300,7 @@ class CvaeEncoder(nn.Module):
     def forward(self, state: Tensor, action: Tensor, is_pad: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and logarithm of the variance of the latent, each (B, Z) float32.
 
-        Args:
-            state: (B, S).
-            action: (B, K, A), finite also where ``is_pad``.
-            is_pad: (B, K) bool, actions to mask out.
+        ``state`` is (B, S); ``action`` (B, K, A) is finite also where ``is_pad`` (B, K).
         """
         batch = state.shape[0]
         class_token = self.class_token.expand(batch, 1, -1)
