@@ -25,10 +25,9 @@ from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.training.batching import BatchLoader
+from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler
 from robo_manip_baselines.training.device import choose_device
 from robo_manip_baselines.training.images import ImageStore, fit_image, processors
-from robo_manip_baselines.training.sampling import ExampleSampler
 
 EXAMPLE = "python benchmarks/batch_loading.py --batch_size 8 --image_size 240x320"
 

@@ -13,17 +13,10 @@ from robo_manip_baselines.runs.command import run_command
 def run(name: str) -> NoReturn:
     """Run a command on ``sys.argv`` and end the process with its exit code.
 
-    The command's module is imported inside, so that a package or an OpenGL backend that is missing
-    becomes one line, too.
-
-    Args:
-        name: module of this package, whose ``main`` takes the arguments.
+    The command's module, ``name`` in this package, is imported inside, so that a package or an
+    OpenGL backend that is missing becomes one line, too.
 
     Raises:
         SystemExit: always.
     """
-
-    def main() -> int | None:
-        return import_module(f"{__name__}.{name}").main(sys.argv[1:])
-
-    run_command(main, backend_problem)
+    run_command(lambda: import_module(f"{__name__}.{name}").main(sys.argv[1:]), backend_problem)

@@ -15,13 +15,18 @@ from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.progress import closing_table
 
+EpisodeFolder = Annotated[
+    Path,
+    tyro.conf.arg(metavar="DIR", help="Folder of episode_*.hdf5 files, as Rollout.py writes it."),
+    tyro.conf.Positional,
+]
+
 
 @dataclass(frozen=True)
 class Verify:
     """Find damaged, mixed-up and misplaced episode files. Ends with 1 if there are any."""
 
-    folder: Annotated[Path, tyro.conf.arg(metavar="DIR"), tyro.conf.Positional]
-    """Folder of episode_*.hdf5 files, as Rollout.py writes it."""
+    folder: EpisodeFolder
     images: bool = True
     """Decode every image, too; --no_images checks the rest only, which is much faster."""
 
@@ -38,18 +43,11 @@ class Verify:
 class Info:
     """List what a folder of episodes holds."""
 
-    folder: Annotated[Path, tyro.conf.arg(metavar="DIR"), tyro.conf.Positional]
-    """Folder of episode_*.hdf5 files, as Rollout.py writes it."""
+    folder: EpisodeFolder
 
     def run(self) -> tuple[str, int]:
         """Return the text to print and the exit code."""
         return closing_table(dataset_info(self.folder)), 0
-
-
-Command = (
-    Annotated[Verify, tyro.conf.subcommand("verify")]
-    | Annotated[Info, tyro.conf.subcommand("info")]
-)
 
 
 def dataset_info(folder: Path) -> dict[str, str]:
@@ -62,13 +60,12 @@ def dataset_info(folder: Path) -> dict[str, str]:
     from robo_manip_baselines.data import list_episodes, read_metadata
     from robo_manip_baselines.data.files import FAILED_FOLDER
 
-    paths = list_episodes(folder)
-    failed_folder = folder / FAILED_FOLDER
+    paths, failed_folder = list_episodes(folder), folder / FAILED_FOLDER
     failed = list_episodes(failed_folder) if failed_folder.is_dir() else []
-    if not paths + failed:
+    if not (tried := paths + failed):
         raise RequestError(f"'{folder}' holds no episode_*.hdf5 file")
-    metadata = [read_metadata(path) for path in paths + failed]
-    size = sum(path.stat().st_size for path in paths + failed)
+    metadata = [read_metadata(path) for path in tried]
+    size = sum(path.stat().st_size for path in tried)
     successes = sum(item["is_success"] for item in metadata)
     strict = sum(item["is_success_strict"] for item in metadata)
     durations = [item["num_steps"] * item["control_period"] for item in metadata]
@@ -114,12 +111,8 @@ def _spread(values: list[float]) -> str:
 
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Dataset.py``."""
-    options = parse(
-        Command,
-        example="python bin/Dataset.py verify dataset/FeedingEnv",
-        description="Inspect and verify a folder of episodes.",
-        args=args,
-    )
-    text, code = options.run()
+    example = "python bin/Dataset.py verify dataset/FeedingEnv"
+    description = "Inspect and verify a folder of episodes."
+    text, code = parse(Verify | Info, example, description=description, args=args).run()
     print(text)  # noqa: T201
     return code

@@ -32,23 +32,20 @@ def replay_episodes(options: ReplayOptions) -> int:
     """
     # Imported here: --help needs no simulator.
     from robo_manip_baselines.data import list_episodes
-    from robo_manip_baselines.rollout.replay import deviation
+    from robo_manip_baselines.rollout.demonstrate import deviation
     from robo_manip_baselines.rollout.videos import write_preview
 
-    paths = [
-        path
-        for given in options.episodes
-        for path in (list_episodes(given) if given.is_dir() else [given])
-    ]
+    paths: list[Path] = []
+    for given in options.episodes:
+        paths += list_episodes(given) if given.is_dir() else [given]
     if not paths:
         raise RequestError("no episode to replay; name files, or a folder that holds some")
     strays = 0
     for path in paths:
         found = deviation(path)
         strays += found.qpos > 0.0 or found.qvel > 0.0
-        print(  # noqa: T201
-            f"{path}: {found.steps} steps, qpos within {found.qpos:g}, qvel within {found.qvel:g}"
-        )
+        within = f"qpos within {found.qpos:g}, qvel within {found.qvel:g}"
+        print(f"{path}: {found.steps} steps, {within}")  # noqa: T201
     print(f"{len(paths) - strays} of {len(paths)} episodes replay bit for bit")  # noqa: T201
     if options.video:
         write_preview(options.video, paths)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -15,7 +14,7 @@ from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
-from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.progress import closing_table
 
@@ -166,10 +165,6 @@ def require_consistent(options: RolloutOptions) -> None:
     if changed:
         wanted = "--policy" if options.scripted else "--scripted"
         raise RequestError(f"--{changed[0]} goes with {wanted}; leave it out")
-    if options.num_episodes < 1:
-        raise RequestError(f"num_episodes {options.num_episodes}: must be 1 or more")
-    if options.seed is not None and options.seed < 0:
-        raise RequestError(f"seed {options.seed}: must be 0 or more")
 
 
 def _changed_options(given: Any, default: Any) -> list[str]:
@@ -197,19 +192,15 @@ def to_collection(options: RolloutOptions) -> Collection:
     from robo_manip_baselines.rollout.demonstrate import Collection
 
     spec, demonstration = options.spec, options.demonstration
-    arms = {} if spec.arms == ObservationSpec().arms else {"arms": spec.arms}
+    env_kwargs: dict[str, Any] = {"cameras": spec.cameras, "image_size": spec.image_size}
+    if spec.arms != UNTRAINED.arms:
+        env_kwargs["arms"] = spec.arms
     return Collection(
         env=options.env,
         out=options.out or Path("dataset") / options.env,
         expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
         seeds=options.seeds(first=0),
-        env_kwargs={
-            "cameras": spec.cameras,
-            "image_size": spec.image_size,
-            **arms,
-            "face_motion": "episode",
-            **options.motion_arguments,
-        },
+        env_kwargs={**env_kwargs, "face_motion": "episode", **options.motion_arguments},
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
@@ -227,10 +218,9 @@ def record(options: RolloutOptions) -> None:
     from robo_manip_baselines.rollout.results import mean_and_sd
     from robo_manip_baselines.rollout.videos import write_preview
 
-    shown = options.demonstration.preview
+    shown, collection = options.demonstration.preview, to_collection(options)
     if shown < 0:
         raise RequestError(f"preview {shown}: must be 0 or more episodes")
-    collection = to_collection(options)
     if shown and not options.spec.cameras and (problem := opengl_problem()):
         logger.warning("no preview video: %s", problem)
         shown = 0
@@ -257,11 +247,7 @@ def record(options: RolloutOptions) -> None:
 
 
 def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> EvaluationConfig:
-    """Return the evaluation that the options of --policy ask for.
-
-    Args:
-        options: parsed with the spec of the checkpoint as defaults.
-        checkpoint: that they name.
+    """Return the evaluation that the options of --policy ask for, given the checkpoint they name.
 
     Raises:
         RequestError: a value is not valid, or differs from the checkpoint where it may not.
@@ -277,18 +263,13 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
             "which checkpoint? give --checkpoint runs/..., as bin/Train.py prints it"
         )
     trained = checkpoint.spec
-    pairs: dict[str, tuple[object, object]] = {
-        "policy": (options.policy, checkpoint.policy),
-        "environment": (options.env, checkpoint.env),
-    }
-    for item in fields(trained):
-        if item.name != "corruption":
-            pairs[item.name] = getattr(options.spec, item.name), getattr(trained, item.name)
-    for name, (typed, value) in pairs.items():
-        if typed != value:
+    typed = {"policy": options.policy, "environment": options.env, **vars(options.spec)}
+    values = {"policy": checkpoint.policy, "environment": checkpoint.env, **vars(trained)}
+    for name, value in values.items():
+        if name != "corruption" and typed[name] != value:
             raise RequestError(
                 f"checkpoint '{checkpoint.folder}' was trained with {name} {_as_typed(value)}, not "
-                f"{_as_typed(typed)}; leave the option as trained, or train another policy"
+                f"{_as_typed(typed[name])}; leave the option as trained, or train another policy"
             )
     corruption = (options.spec.corruption if options.corruption else Corruption()).pinned()
     is_given = options.corruption and not corruption.is_same_as(trained.corruption)
@@ -314,27 +295,10 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
     )
 
 
-def evaluate_policy(options: RolloutOptions, checkpoint: Checkpoint | None) -> None:
-    """Evaluate a checkpoint and print the closing table.
-
-    Raises:
-        RequestError: the request cannot be met.
-    """
-    from robo_manip_baselines.rollout.evaluation import EvaluationPlan, run_plan
-    from robo_manip_baselines.rollout.results import summary_table
-
-    plan = EvaluationPlan.of(to_evaluation(options, checkpoint))
-    summary, videos = run_plan(plan)
-    names = ", ".join(str(path.relative_to(plan.out)) for path in videos)
-    facts = {"written to": str(plan.out), "videos": names or "-"}
-    print(summary_table(plan.env.task, summary, facts))  # noqa: T201
-
-
 def _as_typed(value: object) -> str:
-    if isinstance(value, tuple):
-        is_size = bool(value) and isinstance(value[0], int)
-        return ("x" if is_size else ",").join(map(str, value)) or "none"
-    return str(value)
+    if not isinstance(value, tuple):
+        return str(value)
+    return ("x" if value and isinstance(value[0], int) else ",").join(map(str, value)) or "none"
 
 
 # -- command line ---------------------------------------------------------------------------------
@@ -347,21 +311,17 @@ def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | Non
         RequestError: one line that names what is wrong and what is valid.
         SystemExit: with code 0 after ``--help``.
     """
-    # What decides the defaults is looked up before the options are parsed.
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("policy", "checkpoint", "error", "error_stats"):
-        early.add_argument(f"--{name}", f"--{name.replace('_', '-')}", nargs="?")
-    found, _ = early.parse_known_args(list(args))
     checkpoint, spec = None, UNTRAINED
-    if found.policy and found.checkpoint:
+    folder = last_value(args, "checkpoint")
+    if last_value(args, "policy") and folder:
         from robo_manip_baselines.policy.checkpoint import read_checkpoint
 
-        checkpoint = read_checkpoint(found.checkpoint)
+        checkpoint = read_checkpoint(folder)
         corruption = checkpoint.spec.corruption
         # The statistics of the training go with its error, and with no other file.
-        if (found.error or corruption.error) not in MEASURED_ERRORS:
+        if (last_value(args, "error") or corruption.error) not in MEASURED_ERRORS:
             corruption = replace(corruption, error_stats=None, stats_sha256=None)
-        elif found.error_stats:
+        elif last_value(args, "error_stats"):
             corruption = replace(corruption, stats_sha256=None)
         spec = replace(checkpoint.spec, corruption=corruption)
     default = RolloutOptions(tyro.MISSING, spec=spec)
@@ -375,5 +335,12 @@ def main(args: Sequence[str]) -> None:
     options, checkpoint = parse_options(args)
     if options.scripted:
         record(options)
-    else:
-        evaluate_policy(options, checkpoint)
+        return
+    config = to_evaluation(options, checkpoint)
+    from robo_manip_baselines.rollout.evaluation import evaluate
+    from robo_manip_baselines.rollout.results import summary_table
+
+    plan, summary, videos = evaluate(config)
+    names = ", ".join(str(path.relative_to(plan.out)) for path in videos)
+    facts = {"written to": str(plan.out), "videos": names or "-"}
+    print(summary_table(plan.env.task, summary, facts))  # noqa: T201

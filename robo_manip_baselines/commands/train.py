@@ -15,17 +15,11 @@ import tyro
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.registry import policy_names, policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
-from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.metrics import read_metrics
 from robo_manip_baselines.runs.progress import closing_table
-from robo_manip_baselines.training.config import (
-    CONFIG,
-    METRICS,
-    Network,
-    TrainConfig,
-    read_config,
-)
+from robo_manip_baselines.training.config import CONFIG, METRICS, Network, TrainConfig, read_config
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 logger = logging.getLogger(__name__)
@@ -49,9 +43,7 @@ class TrainCommandOptions(Generic[Network]):
 def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfig[Any]:
     """Read a command line; its preset and its YAML file give the defaults.
 
-    Args:
-        args: without the name of the program.
-        has_gpu: decides the preset ``auto``; if None, PyTorch is asked where that is needed.
+    ``has_gpu`` decides the preset ``auto``; if None, PyTorch is asked where that is needed.
 
     Raises:
         RequestError: one line that names what is wrong and what is valid.
@@ -66,15 +58,15 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     values = read_config(file) if file else {}
     if values.setdefault("policy", policy) != policy:
         raise RequestError(f"'{file}' is of policy {values['policy']}, not {policy}")
-    preset = _last_value(args, "preset") or str(values.get("preset", "auto"))
+    env = last_value(args, "env") or str(values.get("env", TrainConfig.env))
+    preset = last_value(args, "preset") or str(values.get("preset", "auto"))
     if preset == "auto":
         preset = _auto_preset(list(presets), False if is_help else has_gpu, is_quiet=is_help)
-    options = TrainCommandOptions(TrainConfig.from_preset(policy, preset))
+    options = TrainCommandOptions(TrainConfig.from_preset(policy, preset, env))
     options = _with_budget(options, values)
     if file:
         options = _apply_yaml(file, {**values, "preset": preset}, options)
-    budgets = {name: _last_value(args, name) for name in ("epochs", "steps")}
-    options = _with_budget(options, budgets)
+    options = _with_budget(options, {n: last_value(args, n) for n in ("epochs", "steps")})
     description = (
         f"Train a policy on demonstrations. Policies: {', '.join(policy_names())}; the options and "
         f"defaults below are those of {policy} with --preset {preset}. Presets of {policy}: "
@@ -148,34 +140,15 @@ def _apply_yaml(
 
 def _yaml_file(args: Sequence[str]) -> Path | None:
     """Return the file of defaults: ``--config``, else that of a run folder to resume."""
-    if given := _last_value(args, "config"):
+    if given := last_value(args, "config"):
         return Path(given)
-    out = _last_value(args, "out")
+    out = last_value(args, "out")
     saved = Path(out) / CONFIG if out else None
     return saved if saved and "--resume" in args and saved.is_file() else None
 
 
-def _last_value(args: Sequence[str], name: str) -> str | None:
-    """Return the value after ``--name`` or ``--name=``; None where it is not given."""
-    found: str | None = None
-    for place, arg in enumerate(args):
-        option, sign, value = arg.partition("=")
-        if option != f"--{name}":
-            continue
-        if sign:
-            found = value
-        elif place + 1 < len(args):
-            found = args[place + 1]
-    return found
-
-
 def summary(config: TrainConfig[Any], first_step: int) -> str:
-    """Return the closing table of a run, from its metrics.
-
-    Args:
-        config: of the run.
-        first_step: steps done before this process.
-    """
+    """Return the closing table of a run, from its metrics; ``first_step`` were done before."""
     losses = {"train": "-", "validation": "-"}
     step, seconds = 0, 0.0
     for line in read_metrics(config.folder / METRICS):
@@ -195,10 +168,7 @@ def summary(config: TrainConfig[Any], first_step: int) -> str:
 
 
 def main(args: Sequence[str]) -> int:
-    """Run ``bin/Train.py``.
-
-    Returns:
-        The exit code: 0, or 130 after an interruption whose state is saved.
+    """Run ``bin/Train.py``; return 0, or 130 after an interruption whose state is saved.
 
     Raises:
         RequestError: the request cannot be met.
@@ -218,8 +188,7 @@ def main(args: Sequence[str]) -> int:
         resume = f"python bin/Train.py {config.policy} --out {out} --resume"
         logger.info("stopped at step %d; continue with: %s", step, resume)
         return code
-    print(summary(config, before[-1][0] if before else 0))  # noqa: T201
-    print(  # noqa: T201
-        f"next: python bin/Rollout.py {config.env} --policy {config.policy} --checkpoint {out}"
-    )
+    evaluate = f"python bin/Rollout.py {config.env} --policy {config.policy} --checkpoint {out}"
+    table = summary(config, before[-1][0] if before else 0)
+    print(f"{table}\nnext: {evaluate}")  # noqa: T201
     return 0

@@ -16,7 +16,12 @@ from typing import TYPE_CHECKING, Any
 from robo_manip_baselines.data.demonstrations import Split
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims, TrainSettings
+from robo_manip_baselines.policy.presets import (
+    ActionExecution,
+    PolicyDims,
+    TrainSettings,
+    with_tuples,
+)
 from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
 from robo_manip_baselines.runs.checkpoints import (
     checkpoint_folder,
@@ -107,8 +112,10 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     try:
         return Checkpoint(
             folder=folder,
-            config=load_part(policy_entry(config["policy"]).config)(**_tuples(config["config"])),
-            dims=PolicyDims(**_tuples(config["sizes"])),
+            config=load_part(policy_entry(config["policy"]).config)(
+                **with_tuples(config["config"])
+            ),
+            dims=PolicyDims(**with_tuples(config["sizes"])),
             spec=ObservationSpec.from_json(config["spec"]),
             execution=ActionExecution.from_json(config["acting"]),
             normalization=Normalization.from_json(stats),
@@ -169,14 +176,11 @@ def write_checkpoint(
     """Write a checkpoint folder, whole or not at all.
 
     Args:
-        folder: name of the folder, which must not exist yet.
-        checkpoint: description of the network; its ``folder`` and ``content_hash`` are not read.
+        folder: must not exist yet.
+        checkpoint: description of the network; returned with this ``folder`` and its hash.
         model_state: the state dict for evaluation.
         trainer_tensors: tensors for resuming, flat names.
         trainer: numbers for resuming, for JSON.
-
-    Returns:
-        The checkpoint, with its folder and hash.
     """
     import safetensors.torch
 
@@ -215,32 +219,18 @@ def read_trainer(checkpoint: Checkpoint) -> tuple[dict[str, Tensor], dict[str, A
 
 
 _UNCHANGED = (
-    "policy",
-    "env",
-    "control_period",
-    "xml_hash",
-    "step",
-    "train_seed",
-    "dataset",
-    "versions",
+    *("policy", "env", "control_period", "xml_hash"),
+    *("step", "train_seed", "dataset", "versions"),
 )
 """Attributes that are in ``config.json`` as they are."""
 
 
 def _on_cpu(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Copies: safetensors takes neither shared memory nor other layouts than row by row."""
-    return {
-        name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()
-    }
+    return {k: v.detach().to("cpu", copy=True).contiguous() for k, v in tensors.items()}
 
 
 def _content_hash(digests: Mapping[str, str]) -> str:
     """Digest of the files that decide the policy's actions: the trainer's state may be deleted."""
     text = "".join(f"{name} {digests[name]}\n" for name in (MODEL, CONFIG, STATS))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
-    }

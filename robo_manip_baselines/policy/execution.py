@@ -9,7 +9,7 @@ Every environment is at a step of its own; its actions depend on its own episode
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,34 +26,13 @@ EnvIds = NDArray[np.intp]
 """(b,) numbers of environments, all different."""
 
 
-class ActionBuffer(Protocol):
-    """Predicted chunks of every environment, from which actions are taken."""
-
-    def reset(self, env_ids: EnvIds) -> None:
-        """Forget the predictions for these environments: new episodes start in them."""
-        ...
-
-    def steps_to_prediction(self, env_ids: EnvIds) -> NDArray[np.intp]:
-        """Return (b,) how many steps each environment can act before it needs a prediction."""
-        ...
-
-    def act(self, env_ids: EnvIds, chunks: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (b, A), given chunks (m, K, A) for those that need one, in order."""
-        ...
-
-
 class TemporalEnsemble:
     """Average, at every step, of all predictions that were made for that step.
 
     The i-th prediction for a step, the oldest being i = 0, has the weight exp(-decay i); weights
     are divided by their sum (public ACT: decay 0.01). Predictions are counted, so a prediction of
-    zero is one like any other. Only sums for the K steps ahead are kept, and no chunk.
-
-    Args:
-        num_envs: n.
-        chunk_size: K.
-        action_size: A.
-        decay: of the weights; more than 0 trusts old predictions more, less than 0 new ones.
+    zero is one like any other. Only sums for the K steps ahead are kept, and no chunk. A decay of
+    more than 0 trusts old predictions more, less than 0 new ones.
     """
 
     def __init__(
@@ -67,8 +46,7 @@ class TemporalEnsemble:
 
     def reset(self, env_ids: EnvIds) -> None:
         """Forget the predictions for these environments."""
-        self._sum[env_ids] = 0.0
-        self._count[env_ids] = 0
+        self._sum[env_ids], self._count[env_ids] = 0.0, 0
 
     def steps_to_prediction(self, env_ids: EnvIds) -> NDArray[np.intp]:
         """Return zeros: a prediction is needed at every step."""
@@ -86,13 +64,7 @@ class TemporalEnsemble:
 
 
 class ActionQueue:
-    """The first actions of each chunk, executed before the next chunk is predicted.
-
-    Args:
-        num_envs: n.
-        chunk_size: K.
-        action_size: A.
-        n_action_steps: actions of a chunk that are executed, 1 to K.
+    """The first ``n_action_steps`` of each chunk, executed before the next chunk is predicted.
 
     Raises:
         RequestError: ``n_action_steps`` is not 1 to K.
@@ -126,10 +98,16 @@ class ActionQueue:
         return action
 
 
+ActionBuffer = TemporalEnsemble | ActionQueue
+
+
 def make_action_buffer(
     execution: ActionExecution, num_envs: int, chunk_size: int, action_size: int
 ) -> ActionBuffer:
-    """Build the buffer that the settings ask for.
+    """Build the buffer of predicted chunks that the settings ask for.
+
+    Its ``reset`` starts episodes, ``steps_to_prediction`` counts the steps before an environment
+    needs a prediction, and ``act`` takes chunks for those that need one.
 
     Raises:
         RequestError: more actions would be executed than a chunk has.
@@ -157,7 +135,7 @@ class PolicyRunner:
         model: the network; it is moved to the device and put into evaluation mode.
         spec: of the observations.
         normalization: of the demonstrations that it was trained on.
-        execution: execution of its chunks.
+        execution: of its chunks.
         num_envs: n.
         device: of the network.
         precision: ``fp32``, or ``bf16`` for the products inside the network.
@@ -220,10 +198,7 @@ class PolicyRunner:
     ) -> NDArray[np.float32]:
         """Return the next actions (b, A) in the units of the environment.
 
-        Args:
-            vectors: (b, S) packed observations.
-            images: (b, N, H, W, 3); rows that are not needed may hold anything.
-            env_ids: (b,) the environments that they come from.
+        ``vectors`` are (b, S) packed observations, ``images`` (b, N, H, W, 3).
 
         Raises:
             RequestError: the network gives numbers that are not finite.

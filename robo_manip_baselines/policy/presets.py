@@ -42,6 +42,11 @@ def require_proportion(config: Any, *names: str) -> None:
             raise RequestError(f"{name} {getattr(config, name)}: must be 0 or more, less than 1")
 
 
+def with_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values that JSON or YAML held, their lists as the tuples that they were."""
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+
+
 @dataclass(frozen=True)
 class PolicyDims:
     """Dimensions of a policy's inputs and outputs.

@@ -1,4 +1,4 @@
-"""Demonstrations: a scripted expert acts in an environment, and every step is recorded."""
+"""Demonstrations: a scripted expert acts, every step is recorded, and can be replayed."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from robo_manip_baselines.data import (
+    EpisodeReader,
     encode_image,
     episode_path,
     finished_seeds,
@@ -31,7 +32,9 @@ from robo_manip_baselines.data import (
 )
 from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
-from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
+from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id, make_env, task_entry
+from robo_manip_baselines.policy.presets import require_at_least
+from robo_manip_baselines.rollout.results import completion_time, require_seeds
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, write_json
 from robo_manip_baselines.runs.versions import software_versions
@@ -58,14 +61,10 @@ class Demonstration(NamedTuple):
 def demonstrate(
     env: gymnasium.Env[Any, Any], expert: str, seed: int, *, codec: str, quality: int
 ) -> Demonstration:
-    """Let an expert act through one episode.
+    """Let an expert, a name in the task's entry, act through one episode.
 
-    Args:
-        env: made by `make_env`; its cameras are recorded.
-        expert: name in the task's entry.
-        seed: of the episode.
-        codec: see `encode_image`.
-        quality: of JPEG, 1 to 100.
+    The cameras of ``env``, made by `make_env`, are recorded; ``codec`` and ``quality`` are those of
+    `encode_image`.
     """
     if env.spec is None:
         raise ValueError("the environment must be made by its id, so that it can be made again")
@@ -89,14 +88,14 @@ def demonstrate(
         rows["is_success"].append(info["is_success"])
         rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated
-    completion_time = info["completion_time"]
+    time = info["completion_time"]
     attributes = {
         "env_id": env.spec.id,
         "env_kwargs": dict(env.spec.kwargs),
         **start,
         "is_success": info["is_success"],
         "is_success_strict": info["is_success_strict"],
-        "completion_time": np.nan if completion_time is None else completion_time,
+        "completion_time": np.nan if time is None else time,
         "versions": software_versions("mujoco", "numpy", "robo_manip_baselines"),
         "seed": seed,
         "expert": expert,
@@ -137,13 +136,8 @@ class Collection:
         object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
         require_choice("expert", self.expert, task_entry(self.env).experts)
         require_choice("image codec", self.codec, CODECS)
-        if self.seeds.start < 0:
-            raise RequestError(f"seed {self.seeds.start}: must be 0 or more")
-        if len(self.seeds) < 1:
-            count = self.seeds.stop - self.seeds.start
-            raise RequestError(f"num_episodes {count}: must be 1 or more")
-        if self.workers < 1:
-            raise RequestError(f"workers {self.workers}: must be at least 1")
+        require_seeds(self.seeds)
+        require_at_least(1, self, "workers")
         if not 1 <= self.quality <= 100:
             raise RequestError(f"image quality {self.quality}: must be 1 to 100")
 
@@ -153,11 +147,7 @@ class Collection:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Collection:
-        """Return the collection that ``to_json`` was called on.
-
-        Raises:
-            RequestError: a value is not valid.
-        """
+        """Return the collection that ``to_json`` was called on."""
         return cls(**{**values, "out": Path(values["out"]), "seeds": range(*values["seeds"])})
 
     def path(self, seed: int) -> Path | None:
@@ -206,11 +196,8 @@ def collect(collection: Collection) -> CollectionSummary:
         done = finished_seeds(collection.out)
         todo = [seed for seed in collection.seeds if seed not in done]
         if len(todo) < len(collection.seeds):
-            logger.info(
-                "%d of %d episodes are there already",
-                len(collection.seeds) - len(todo),
-                len(collection.seeds),
-            )
+            total = len(collection.seeds)
+            logger.info("%d of %d episodes are there already", total - len(todo), total)
         steps, begin = 0, time.perf_counter()
         with tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress:
             for count in _record_all(collection, env, todo):
@@ -234,19 +221,14 @@ def _summarize(
     collection: Collection, steps: int, steps_per_second: float | None
 ) -> CollectionSummary:
     """Summarize the files of a collection."""
-    outcomes = {
-        seed: read_metadata(path) for seed in collection.seeds if (path := collection.path(seed))
-    }
+    paths = {seed: collection.path(seed) for seed in collection.seeds}
+    outcomes = {seed: read_metadata(path) for seed, path in paths.items() if path}
     times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
+    mean, sd = completion_time(times)
+    strict = sum(bool(o["is_success_strict"]) for o in outcomes.values())
+    failed = [seed for seed, o in outcomes.items() if not o["is_success"]]
     return CollectionSummary(
-        episodes=len(outcomes),
-        successes=len(times),
-        strict_successes=sum(bool(o["is_success_strict"]) for o in outcomes.values()),
-        failed_seeds=[seed for seed, o in outcomes.items() if not o["is_success"]],
-        completion_time_mean=float(np.mean(times)) if times else None,
-        completion_time_sd=float(np.std(times, ddof=1)) if len(times) > 1 else None,
-        steps=steps,
-        steps_per_second=steps_per_second,
+        len(outcomes), len(times), strict, failed, mean, sd, steps, steps_per_second
     )
 
 
@@ -271,9 +253,8 @@ def _record_all(
 
 def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> int:
     """Record one episode into its file; return its number of steps."""
-    demonstration = demonstrate(
-        env, collection.expert, seed, codec=collection.codec, quality=collection.quality
-    )
+    codec, quality = collection.codec, collection.quality
+    demonstration = demonstrate(env, collection.expert, seed, codec=codec, quality=quality)
     path = episode_path(collection.out, seed, demonstration.attributes["is_success"])
     write_episode(path, *demonstration)
     return len(demonstration.arrays["time"])
@@ -320,10 +301,8 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     Raises:
         RequestError: naming the first setting that differs.
     """
-    if not collection.out.is_dir():
-        return
-    paths = (collection.path(seed) for seed in sorted(finished_seeds(collection.out)))
-    present = next((path for path in paths if path), None)
+    done = sorted(finished_seeds(collection.out))
+    present = next((path for seed in done if (path := collection.path(seed))), None)
     if present is None:
         return
     there = read_metadata(present)
@@ -341,3 +320,66 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
                 f"'{collection.out}' holds episodes with {name} {there[name]}, not {value}; "
                 "give another --out or remove that folder"
             )
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Largest deviation of the simulator's state from the recorded one.
+
+    Attributes:
+        qpos: m, rad.
+        qvel: m/s, rad/s.
+        steps: how many were compared.
+    """
+
+    qpos: float
+    qvel: float
+    steps: int
+
+
+def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any]:
+    """Make the environment that an episode was recorded in.
+
+    Args:
+        episode: open file.
+        **changes: arguments that shall differ, such as the cameras.
+
+    Raises:
+        RequestError: this release's environment is not the recorded one.
+    """
+    recorded = episode.attributes
+    task = entry_of_id(recorded["env_id"])
+    env = make_env(task.name, **{**recorded["env_kwargs"], **changes})
+    xml_hash = world_of(env).xml_hash
+    if xml_hash != recorded["xml_hash"]:
+        env.close()
+        raise RequestError(
+            f"'{episode.path}' was recorded with another model (hash {recorded['xml_hash'][:12]}, "
+            f"here {xml_hash[:12]}); install the release that recorded it, "
+            f"{recorded['versions']['robo_manip_baselines']}"
+        )
+    return env
+
+
+def replay(env: gymnasium.Env[Any, Any], episode: EpisodeReader) -> Iterator[int]:
+    """Replay an episode in an environment from `remake_env`, as before each step yielded."""
+    env.reset(seed=int(episode.attributes["seed"]))
+    for step, action in enumerate(episode.array("action")):
+        yield step
+        env.step(action)
+
+
+def deviation(path: Path) -> Deviation:
+    """Replay an episode and compare every state with the recorded one.
+
+    Raises:
+        RequestError: the file is damaged, or of another model.
+    """
+    with EpisodeReader(path) as episode, contextlib.closing(remake_env(episode, cameras=())) as env:
+        qpos, qvel = episode.array("qpos"), episode.array("qvel")
+        data = world_of(env).data
+        worst = np.zeros(2)
+        for step in replay(env, episode):
+            strays = np.abs(data.qpos - qpos[step]).max(), np.abs(data.qvel - qvel[step]).max()
+            worst = np.maximum(worst, strays)
+        return Deviation(float(worst[0]), float(worst[1]), len(episode))

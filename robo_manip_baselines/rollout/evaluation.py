@@ -18,12 +18,13 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model, read_checkpoint
-from robo_manip_baselines.policy.presets import ActionExecution
+from robo_manip_baselines.policy.presets import ActionExecution, require_at_least
 from robo_manip_baselines.rollout.results import (
     SUMMARY,
     EpisodeResult,
     EvaluationSummary,
-    ResultsFile,
+    open_results,
+    require_seeds,
     summarize,
 )
 from robo_manip_baselines.rollout.rollout import ActingPolicy, Recording, rollout
@@ -87,18 +88,11 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
-        if len(self.seeds) < 1:
-            count = self.seeds.stop - self.seeds.start
-            raise RequestError(f"num_episodes {count}: must be 1 or more")
-        for name, value, least in (
-            ("seed", self.seeds.start, 0),
-            ("num_envs", self.num_envs, 1),
-            ("workers", self.workers, 0),
-            ("video", self.videos, 0),
-            ("n_action_steps", self.n_action_steps, 1),
-        ):
-            if value is not None and value < least:
-                raise RequestError(f"{name} {value}: must be {least} or more")
+        require_seeds(self.seeds)
+        require_at_least(1, self, "num_envs", "n_action_steps")
+        require_at_least(0, self, "workers")
+        if self.videos < 0:
+            raise RequestError(f"video {self.videos}: must be 0 or more")
         if self.temporal_ensemble and self.n_action_steps is not None:
             raise RequestError("--temporal_ensemble and --n_action_steps: give one of them")
 
@@ -118,14 +112,11 @@ class EvaluationConfig:
         Raises:
             RequestError: a value is not valid.
         """
-        out, corruption = values.get("out"), values.get("corruption")
-        given: dict[str, Any] = {
-            **values,
-            "checkpoint": Path(values["checkpoint"]),
-            "seeds": range(*values["seeds"]),
-            "out": None if out is None else Path(out),
-            "corruption": None if corruption is None else Corruption.from_json(corruption),
-        }
+        given = {**values, "seeds": range(*values["seeds"])}
+        readers: Any = {"checkpoint": Path, "out": Path, "corruption": Corruption.from_json}
+        for name, read in readers.items():
+            if values.get(name) is not None:
+                given[name] = read(values[name])
         return cls(**given)
 
 
@@ -138,7 +129,6 @@ class EvaluationPlan:
         checkpoint: of the policy.
         env: environment in which the policy acts.
         execution: of the policy's chunks of actions.
-        out: folder of the results.
         device: of the network.
     """
 
@@ -146,7 +136,6 @@ class EvaluationPlan:
     checkpoint: Checkpoint
     env: EnvConfig
     execution: ActionExecution
-    out: Path
     device: torch.device
 
     @classmethod
@@ -172,39 +161,45 @@ class EvaluationPlan:
         if (spec.cameras or config.videos) and (problem := opengl_problem()):
             why = "the policy sees images" if spec.cameras else "--video 0 needs no OpenGL"
             raise RequestError(f"{problem} ({why})")
-        suffix = _corruption_suffix(checkpoint, env)
-        out = Path("results") / f"{checkpoint.env}_{run_name(config.checkpoint)}{suffix}"
-        return cls(
-            config=config,
-            checkpoint=checkpoint,
-            env=env,
-            execution=choose_execution(
-                checkpoint.execution, config.temporal_ensemble, config.n_action_steps
-            ),
-            out=config.out or out,
-            device=choose_device(config.device),
+        execution = choose_execution(
+            checkpoint.execution, config.temporal_ensemble, config.n_action_steps
         )
+        return cls(config, checkpoint, env, execution, choose_device(config.device))
 
     def __str__(self) -> str:
         execution, checkpoint, seeds = self.execution, self.checkpoint, self.config.seeds
-        how = (
-            f"temporal ensemble (decay {execution.ensemble_decay:g})"
-            if execution.temporal_ensemble
-            else f"{execution.n_action_steps} actions of each chunk"
-        )
+        how = f"{execution.n_action_steps} actions of each chunk"
+        if execution.temporal_ensemble:
+            how = f"temporal ensemble (decay {execution.ensemble_decay:g})"
         return (
             f"{checkpoint.policy}, {self.condition}, step {checkpoint.step}, on "
             f"{self.device} in {self.config.precision}: {how}; seeds {seeds[0]} to {seeds[-1]}"
         )
 
     @property
+    def corruption_suffix(self) -> str:
+        """Name of a corruption that is not the one of the training: ``_under_delay3``."""
+        corruption = self.env.spec.corruption
+        if corruption.is_same_as(self.checkpoint.spec.corruption):
+            return ""
+        return f"_under_{corruption.label or 'truth'}"
+
+    @property
     def condition(self) -> str:
         """Name of the experimental condition, such as ``current_pred_h2_under_delay3``."""
-        return self.checkpoint.spec.name + _corruption_suffix(self.checkpoint, self.env)
+        return self.checkpoint.spec.name + self.corruption_suffix
+
+    @property
+    def out(self) -> Path:
+        """Folder of the results."""
+        name = f"{self.env.env}_{run_name(self.config.checkpoint)}{self.corruption_suffix}"
+        return self.config.out or Path("results") / name
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What results of one folder must have in common."""
+        """Settings that the results of one folder have in common."""
+        acting = self.execution.to_json()  # only what makes a difference
+        del acting["execute" if self.execution.temporal_ensemble else "decay"]
         return {
             "env": self.env.task.env_id,
             "env_kwargs": self.env.env_kwargs,
@@ -212,7 +207,7 @@ class EvaluationPlan:
             "xml_hash": self.checkpoint.xml_hash,
             "policy": self.checkpoint.policy,
             "checkpoint": self.checkpoint.content_hash,
-            "acting": _effective(self.execution),
+            "acting": acting,
             "device": self.device.type,
             "precision": self.config.precision,
         }
@@ -220,12 +215,11 @@ class EvaluationPlan:
     @property
     def facts(self) -> dict[str, Any]:
         """Further facts that are recorded beside results."""
-        checkpoint = self.checkpoint
         return {
             "condition": self.condition,
-            "checkpoint_folder": str(checkpoint.folder),
-            "checkpoint_step": checkpoint.step,
-            "train_seed": checkpoint.train_seed,
+            "checkpoint_folder": str(self.checkpoint.folder),
+            "checkpoint_step": self.checkpoint.step,
+            "train_seed": self.checkpoint.train_seed,
             "first_seed": self.config.seeds[0],
         }
 
@@ -233,15 +227,11 @@ class EvaluationPlan:
         """Load the network and make it act in so many environments."""
         from robo_manip_baselines.policy.execution import PolicyRunner
 
-        checkpoint = self.checkpoint
+        checkpoint, precision = self.checkpoint, self.config.precision
+        model = load_model(checkpoint, self.device)
+        facts = checkpoint.spec, checkpoint.normalization, self.execution
         return PolicyRunner(
-            load_model(checkpoint, self.device),
-            checkpoint.spec,
-            checkpoint.normalization,
-            self.execution,
-            num_envs=num_envs,
-            device=self.device,
-            precision=self.config.precision,
+            model, *facts, num_envs=num_envs, device=self.device, precision=precision
         )
 
     def run(self, seeds: Sequence[int], on_episode: OnEpisode) -> None:
@@ -292,26 +282,18 @@ class EvaluationPlan:
             torch.set_num_threads(before)
 
 
-def evaluate(config: EvaluationConfig) -> EvaluationSummary:
-    """Evaluate a checkpoint: run the episodes that its folder lacks, summarize, write videos.
-
-    Raises:
-        RequestError: the request cannot be met.
-    """
-    return run_plan(EvaluationPlan.of(config))[0]
-
-
-def run_plan(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
-    """Run the episodes that the folder of an evaluation lacks; write summary and videos.
+def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummary, list[Path]]:
+    """Evaluate a checkpoint: run the episodes that its folder lacks, write summary and videos.
 
     Returns:
-        The summary, and the files of all videos.
+        The plan that was carried out, the summary, and the files of all videos.
 
     Raises:
         RequestError: the folder holds other results, or the request cannot be met.
     """
+    plan = EvaluationPlan.of(config)
     logger.info("%s", plan)
-    seeds, number, split = plan.config.seeds, plan.config.videos, plan.checkpoint.split
+    seeds, number, split = config.seeds, config.videos, plan.checkpoint.split
     if known := sorted(set(seeds) & {*split.train, *split.validation}):
         logger.warning(
             "%d of the seeds are also seeds of the demonstrations (the first is %d); results on "
@@ -320,7 +302,7 @@ def run_plan(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
             known[0],
         )
     recordings: dict[int, Recording] = {}
-    with ResultsFile(plan.out, plan.settings, plan.facts) as file:
+    with open_results(plan.out, plan.settings, plan.facts) as file:
         todo = [seed for seed in seeds if seed not in file.done]
         if len(todo) < len(seeds):
             logger.info("%d of %d episodes are there already", len(seeds) - len(todo), len(seeds))
@@ -347,7 +329,7 @@ def run_plan(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
     plan.run(again, lambda result, recording: recordings.update({result.seed: recording}))
     for path, result in missing.items():
         write_video(path, plan.env, result, recordings[result.seed])
-    return summary, list(videos)
+    return plan, summary, list(videos)
 
 
 def choose_execution(
@@ -365,21 +347,6 @@ def run_name(checkpoint: Path) -> str:
     if path.parent.name == CHECKPOINTS:
         return f"{path.parent.parent.name}_{path.name}"
     return path.name
-
-
-def _corruption_suffix(checkpoint: Checkpoint, env: EnvConfig) -> str:
-    """Name a corruption that is not the one of the training: ``_under_delay3``; else nothing."""
-    corruption = env.spec.corruption
-    if corruption.is_same_as(checkpoint.spec.corruption):
-        return ""
-    return f"_under_{corruption.label or 'truth'}"
-
-
-def _effective(execution: ActionExecution) -> dict[str, Any]:
-    """Return the settings that make a difference, in the names of ``evaluation.json``."""
-    if execution.temporal_ensemble:
-        return {"temporal_ensemble": True, "decay": execution.ensemble_decay}
-    return {"temporal_ensemble": False, "execute": execution.n_action_steps}
 
 
 def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> None:

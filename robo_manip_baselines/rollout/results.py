@@ -11,15 +11,15 @@ import os
 import types
 import typing
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TextIO
 
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn, TaskEntry, task_entry
+from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import prepare_folder, read_json, write_json, write_text
 from robo_manip_baselines.runs.progress import closing_table
@@ -105,20 +105,32 @@ class EpisodeResult:
         hints.pop("columns")
         given = {name: _checked(values, name, hint) for name, hint in hints.items()}
         task = task_entry(given["env"])
-        columns = {c.name: _checked(values, c.name, _hint_of(c)) for c in task.columns}
+        columns = {}
+        for column in task.columns:
+            kind: Any = Vector if column.kind == "vector" else float
+            hint = kind | None if column.is_optional else kind
+            value = _checked(values, column.name, hint)
+            columns[column.name] = tuple(value) if isinstance(value, list) else value
         if unknown := sorted(set(values) - set(given) - set(columns)):
             raise ValueError(f"'{unknown[0]}' is unknown")
         if given["failure"] and given["failure"] not in task.failures:
             raise ValueError(f"'failure' is {json.dumps(given['failure'])}")
-        return cls(**given, columns={k: _with_tuples(v) for k, v in columns.items()})
+        return cls(**given, columns=columns)
+
+
+def require_seeds(seeds: range) -> None:
+    """Require one seed or more, none of them negative.
+
+    Raises:
+        RequestError: naming the option that is wrong.
+    """
+    if not seeds:
+        raise RequestError(f"num_episodes {seeds.stop - seeds.start}: must be 1 or more")
+    if seeds.start < 0:
+        raise RequestError(f"seed {seeds.start}: must be 0 or more")
 
 
 Vector = tuple[float, float, float]
-
-
-def _hint_of(column: ResultColumn) -> Any:
-    kind: Any = Vector if column.kind == "vector" else float
-    return kind | None if column.is_optional else kind
 
 
 def _checked(values: dict[str, Any], name: str, hint: Any) -> Any:
@@ -131,24 +143,19 @@ def _checked(values: dict[str, Any], name: str, hint: Any) -> Any:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a JSON value is of the declared type."""
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        return any(_fits(value, part) for part in typing.get_args(hint))
-    if hint is float:
-        return isinstance(value, float | int) and not isinstance(value, bool)
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    if hint == Vector:
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        return any(_fits(value, part) for part in parts)
+    if origin is tuple:
         return isinstance(value, list) and len(value) == 3 and all(_fits(v, float) for v in value)
-    if typing.get_origin(hint) is dict:
-        is_text = typing.get_args(hint)[1] is str
+    if origin is dict:
+        is_text = parts[1] is str
         return isinstance(value, dict) and all(
             isinstance(v, str) or not is_text for v in value.values()
         )
+    if hint in (float, int):
+        return isinstance(value, hint | int) and not isinstance(value, bool)
     return isinstance(value, hint)
-
-
-def _with_tuples(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def read_rows(path: Path) -> list[EpisodeResult]:
@@ -160,9 +167,8 @@ def read_rows(path: Path) -> list[EpisodeResult]:
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        raise RequestError(
-            f"'{path}' cannot be read: {error.strerror}; name a results.jsonl file"
-        ) from error
+        line = f"'{path}' cannot be read: {error.strerror}; name a results.jsonl file"
+        raise RequestError(line) from error
     rows = []
     for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
         try:
@@ -191,52 +197,17 @@ def read_results(folder: str | Path) -> list[EpisodeResult]:
 
 
 class ResultsFile:
-    """Results of one evaluation, appended as episodes end. Use as a context manager.
-
-    Args:
-        folder: created if need be.
-        settings: what all episodes of the folder must share, ready for JSON.
-        facts: further facts to record, ready for JSON.
+    """Results of one evaluation, appended as episodes end; from `open_results`.
 
     Attributes:
-        done: results that the folder already holds, by seed.
-
-    Raises:
-        RequestError: the folder holds results of other settings, is damaged, or cannot be written.
+        done: results that the folder holds, by seed.
     """
 
-    def __init__(self, folder: Path, settings: dict[str, Any], facts: dict[str, Any]) -> None:
-        self._path = folder / RESULTS
-        _refuse_other_settings(folder, settings)
-        self.done = {r.seed: r for r in read_results(folder)} if self._path.exists() else {}
-        prepare_folder(folder)
-        if not (folder / MANIFEST).exists():
-            content = {"schema": SCHEMA, "version": SCHEMA_VERSION, "settings": settings, **facts}
-            write_json(folder / MANIFEST, content)
-        self._file: TextIO | None = None
-
-    def __enter__(self) -> ResultsFile:
-        _drop_torn_line(self._path)
-        self._file = self._path.open("a", encoding="utf-8")
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._file:
-            self._file.close()
-            self._file = None
-        if exc_type is None:
-            rows = self.of(sorted(self.done))
-            write_text(self._path, "".join(f"{row.to_line()}\n" for row in rows))
+    def __init__(self, file: TextIO, done: dict[int, EpisodeResult]) -> None:
+        self._file, self.done = file, done
 
     def append(self, result: EpisodeResult) -> None:
         """Write a row; it is on the disk when this returns."""
-        if self._file is None:
-            raise ValueError("open it with a with statement before appending")
         self._file.write(result.to_line() + "\n")
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -245,6 +216,34 @@ class ResultsFile:
     def of(self, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Return the results of these seeds, as far as they are there."""
         return [self.done[seed] for seed in seeds if seed in self.done]
+
+
+@contextmanager
+def open_results(
+    folder: Path, settings: dict[str, Any], facts: dict[str, Any]
+) -> Iterator[ResultsFile]:
+    """Open the results of an evaluation; if all went well, sort them by seed at the end.
+
+    Args:
+        folder: created if need be.
+        settings: what all episodes of the folder must share, ready for JSON.
+        facts: further facts to record, ready for JSON.
+
+    Raises:
+        RequestError: the folder holds results of other settings, is damaged, or cannot be written.
+    """
+    path = folder / RESULTS
+    _refuse_other_settings(folder, settings)
+    done = {r.seed: r for r in read_results(folder)} if path.exists() else {}
+    prepare_folder(folder)
+    if not (folder / MANIFEST).exists():
+        content = {"schema": SCHEMA, "version": SCHEMA_VERSION, "settings": settings, **facts}
+        write_json(folder / MANIFEST, content)
+    if path.exists():  # drop a torn row
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
+    with path.open("a", encoding="utf-8") as file:
+        yield ResultsFile(file, done)
+    write_text(path, "".join(f"{done[seed].to_line()}\n" for seed in sorted(done)))
 
 
 def _refuse_other_settings(folder: Path, settings: dict[str, Any]) -> None:
@@ -271,15 +270,6 @@ def _refuse_other_settings(folder: Path, settings: dict[str, Any]) -> None:
                 f"'{folder}' holds results with {name} {there.get(name)}, not {wanted.get(name)}; "
                 "give another --out or remove that folder"
             )
-
-
-def _drop_torn_line(path: Path) -> None:
-    if not path.exists():
-        return
-    content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        os.truncate(path, whole)
 
 
 @dataclass(frozen=True)
@@ -346,33 +336,25 @@ class EvaluationSummary:
 def summarize(
     task: TaskEntry, results: Sequence[EpisodeResult], *, new: int, seconds: float
 ) -> EvaluationSummary:
-    """Summarize the results of all episodes.
-
-    Args:
-        task: that they are of.
-        results: of all episodes.
-        new: number of them that this run made.
-        seconds: of this run.
-    """
+    """Summarize the results of all episodes, of which this run made ``new`` in ``seconds``."""
     total, limit = len(results), task.success_time_limit
     times = [r.completion_time for r in results if r.completion_time is not None]
+    mean, sd = completion_time(times)
     kinds = Counter(r.failure for r in results)
     columns = {}
     for column in task.columns:
-        values = [r.columns[column.name] for r in results]
-        found = [value for value in values if value is not None]
+        found = [v for r in results if (v := r.columns[column.name]) is not None]
         if column.kind == "float" and found:
             columns[column.name] = {"median": float(np.median(found)), "max": max(found)}
+    # Times are whole control steps; the limit itself is within.
+    within = None if limit is None else Proportion.of(sum(t <= limit for t in times), total)
     return EvaluationSummary(
         episodes=total,
         success=Proportion.of(sum(r.is_success for r in results), total),
         strict_success=Proportion.of(sum(r.is_success_strict for r in results), total),
-        # Times are whole control steps; the limit itself is within.
-        success_within_limit=None
-        if limit is None
-        else Proportion.of(sum(t <= limit for t in times), total),
-        completion_time_mean=float(np.mean(times)) if times else None,
-        completion_time_sd=float(np.std(times, ddof=1)) if len(times) > 1 else None,
+        success_within_limit=within,
+        completion_time_mean=mean,
+        completion_time_sd=sd,
         columns=columns,
         failures={kind: kinds[kind] for kind in task.failures},
         failed_seeds=[r.seed for r in results if not r.is_success],
@@ -381,22 +363,21 @@ def summarize(
     )
 
 
+def completion_time(times: Sequence[float]) -> tuple[float | None, float | None]:
+    """Return mean and sample standard deviation of times in s; None without enough of them."""
+    sd = float(np.std(times, ddof=1)) if len(times) > 1 else None
+    return float(np.mean(times)) if times else None, sd
+
+
 def summary_table(task: TaskEntry, summary: EvaluationSummary, facts: dict[str, str]) -> str:
     """Lay out the closing table; ``facts`` are further rows at its end."""
-    total, limit = summary.episodes, summary.success_within_limit
     failures = [f"{kind} {count}" for kind, count in summary.failures.items() if count]
-    rate = summary.episodes_per_second
-
-    def proportion(part: Proportion) -> str:
-        return f"{part.count}/{total}  {part}"
-
-    rows = {
-        "episodes": str(total),
-        "success": proportion(summary.success),
-        "strict success": proportion(summary.strict_success),
-    }
-    if limit:
-        rows[f"success in {task.success_time_limit:g} s"] = proportion(limit)
+    total, rate = summary.episodes, summary.episodes_per_second
+    proportions = {"success": summary.success, "strict success": summary.strict_success}
+    if summary.success_within_limit:
+        proportions[f"success in {task.success_time_limit:g} s"] = summary.success_within_limit
+    rows = {"episodes": str(total)}
+    rows |= {name: f"{part.count}/{total}  {part}" for name, part in proportions.items()}
     rows["completion time"] = mean_and_sd(summary.completion_time_mean, summary.completion_time_sd)
     for name, values in summary.columns.items():
         label = name.replace("_", " ")
@@ -413,4 +394,4 @@ def mean_and_sd(mean: float | None, sd: float | None) -> str:
     """Format a mean time with its standard deviation: ``5.69 ± 0.96 s``."""
     if mean is None:
         return "-"
-    return f"{mean:.2f}" + (f" ± {sd:.2f} s" if sd is not None else " s")
+    return f"{mean:.2f} s" if sd is None else f"{mean:.2f} ± {sd:.2f} s"

@@ -37,10 +37,8 @@ class ActingPolicy(Protocol):
     ) -> NDArray[np.float32]:
         """Return the next actions (b, A), each from its own row of the observations alone.
 
-        Args:
-            vectors: (b, S) packed observations.
-            images: (b, N, H, W, 3); None without cameras. Rows that need none may hold anything.
-            env_ids: (b,) environments that they come from.
+        ``vectors`` are (b, S) packed observations, ``images`` (b, N, H, W, 3), None without
+        cameras; rows that need none may hold anything.
         """
         ...
 
@@ -74,11 +72,8 @@ def rollout(
     Args:
         policy: for as many environments.
         envs: from ``open_envs``.
-        seeds: of the episodes, none of them twice.
+        seeds: of the episodes, none of them twice; the results are in their order.
         on_episode: called with every episode that has ended, in the order in which they end.
-
-    Returns:
-        Results in the order of the seeds.
 
     Raises:
         ValueError: a seed is there twice.
@@ -91,35 +86,35 @@ def rollout(
     recordings: dict[int, Recording] = {}
     results: dict[int, EpisodeResult] = {}
 
+    def request(numbers: list[int], seeds: Sequence[int | None]) -> list[StepRequest]:
+        needs = policy.needs_images(np.array(numbers, dtype=np.intp)).tolist()
+        return [StepRequest(*parts) for parts in zip(numbers, seeds, needs, strict=True)]
+
     def start(numbers: Sequence[int]) -> list[StepRequest]:
         """Start the next seeds in these environments, as long as there are any."""
         used = list(numbers[: len(waiting)])
         if not used:
             return []
         started = [waiting.popleft() for _ in used]
-        env_ids = np.array(used, dtype=np.intp)
-        policy.reset(env_ids, started)
+        policy.reset(np.array(used, dtype=np.intp), started)
         recordings.update((number, Recording()) for number in used)
-        needs = policy.needs_images(env_ids).tolist()
-        return [StepRequest(*request) for request in zip(used, started, needs, strict=True)]
+        return request(used, started)
 
     def act(numbers: list[int]) -> list[StepRequest]:
         """Let the policy act in these environments."""
         if not numbers:
             return []
         env_ids = np.array(numbers, dtype=np.intp)
-        vectors = arrays.vectors[env_ids]
-        actions = policy.act(vectors, arrays.images[env_ids] if has_images else None, env_ids)
-        arrays.actions[env_ids] = actions
+        vectors = arrays["vectors"][env_ids]
+        images = arrays["images"][env_ids] if has_images else None
+        actions = policy.act(vectors, images, env_ids)
+        arrays["actions"][env_ids] = actions
         for number, vector, action in zip(numbers, vectors, actions, strict=True):
             recordings[number].vectors.append(vector)
             recordings[number].actions.append(action)
-        needs = policy.needs_images(env_ids).tolist()
-        return [
-            StepRequest(number, None, need) for number, need in zip(numbers, needs, strict=True)
-        ]
+        return request(numbers, [None] * len(numbers))
 
-    requests, running = start(range(arrays.num_envs)), 0
+    requests, running = start(range(len(arrays))), 0
     while requests or running:
         envs.submit(requests)
         running += len(requests)

@@ -5,11 +5,12 @@ Images are RGB, (H, W, 3) uint8; drawing functions return a new image and leave 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
 import av
 import cv2
@@ -21,7 +22,7 @@ from robo_manip_baselines.data import EpisodeReader, read_metadata
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.tasks.face_env import CONTROL_PERIOD, FaceEnv, world_of
 from robo_manip_baselines.observation import CAMERAS
-from robo_manip_baselines.rollout.replay import remake_env, replay
+from robo_manip_baselines.rollout.demonstrate import remake_env, replay
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
 from robo_manip_baselines.rollout.workers import EnvConfig
@@ -52,8 +53,8 @@ CLOSE_UP = "front_close"
 ZOOM = 3
 """Magnification of the fourth view, of the surroundings of the target."""
 
-HOLD_SECONDS = 1.0
-"""for which the last frame, with the outcome, stays."""
+HOLD_FRAMES = round(1.0 * FPS)
+"""Repetitions of the last frame, with the outcome: 1 s."""
 
 
 class VideoWriter:
@@ -72,38 +73,32 @@ class VideoWriter:
     def __init__(self, path: str | Path, fps: float, *, crf: int = 20) -> None:
         if fps <= 0:
             raise ValueError(f"a video needs a positive number of frames a second, not {fps}")
-        self.path = Path(path)
-        self._fps = Fraction(fps).limit_denominator(1001)
-        self._crf = crf
-        self._stack = ExitStack()
         self._shape: tuple[int, ...] | None = None
+        self._file = self._open(Path(path), Fraction(fps).limit_denominator(1001), crf)
 
     def __enter__(self) -> VideoWriter:
-        temporary = self._stack.enter_context(atomic_file(self.path))
-        # The index goes to the front so that a browser starts to play before all has arrived.
-        self._container = self._stack.enter_context(
-            av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"})
-        )
-        stream = self._container.add_stream("libx264", rate=self._fps)
-        stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": str(self._crf), "preset": "medium"}
-        stream.codec_context.thread_count = 1  # the same bytes whatever the number of cores
-        self._stream = stream
+        self._file.__enter__()
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if exc is None:
-            try:
-                self._finish()
-            except BaseException as error:
-                self._stack.__exit__(type(error), error, error.__traceback__)
-                raise
-        self._stack.__exit__(exc_type, exc, traceback)
+    def __exit__(self, *error: Any) -> None:
+        self._file.__exit__(*error)
+
+    @contextmanager
+    def _open(self, path: Path, rate: Fraction, crf: int) -> Iterator[None]:
+        # The index goes to the front so that a browser starts to play before all has arrived.
+        options = {"movflags": "+faststart"}
+        with (
+            atomic_file(path) as temporary,
+            av.open(str(temporary), "w", format="mp4", options=options) as self._container,
+        ):
+            self._stream = self._container.add_stream("libx264", rate=rate)
+            self._stream.pix_fmt = "yuv420p"
+            self._stream.options = {"crf": str(crf), "preset": "medium"}
+            self._stream.codec_context.thread_count = 1  # the same bytes on any number of cores
+            yield
+            if self._shape is None:
+                raise ValueError(f"no frame was written to '{path}'")
+            self._container.mux(self._stream.encode(None))
 
     def write(self, image: np.ndarray) -> None:
         """Append a frame.
@@ -122,11 +117,6 @@ class VideoWriter:
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
         self._container.mux(self._stream.encode(frame))
 
-    def _finish(self) -> None:
-        if self._shape is None:
-            raise ValueError(f"no frame was written to '{self.path}'")
-        self._container.mux(self._stream.encode(None))
-
 
 def pad_to_even(image: np.ndarray) -> np.ndarray:
     """Repeat the last row or column of an image with an odd height or width."""
@@ -135,20 +125,14 @@ def pad_to_even(image: np.ndarray) -> np.ndarray:
 
 
 def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Join images of any sizes in a row, each scaled to the height of the first.
-
-    Returns:
-        (H, sum of widths, 3) uint8.
-    """
+    """Join images in a row, (H, sum of widths, 3), each scaled to the height of the first."""
     if not images:
         raise ValueError("no image to put side by side")
-    height = images[0].shape[0]
-    row: list[np.ndarray] = []
+    height, row = images[0].shape[0], []
     for image in images:
         if image.shape[0] != height:
             width = max(1, round(image.shape[1] * height / image.shape[0]))
-            is_smaller = height < image.shape[0]
-            method = cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR
+            method = cv2.INTER_AREA if height < image.shape[0] else cv2.INTER_LINEAR
             image = np.asarray(cv2.resize(image, (width, height), interpolation=method))
         row.append(image)
     return np.concatenate(row, axis=1)
@@ -171,9 +155,6 @@ def draw_track(
         colour: RGB.
         thickness: of the line, in pixels.
         radius: of the ring, in pixels.
-
-    Returns:
-        A new image.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     # Far outside the image a line is cut off unseen; OpenCV's fixed-point numbers overflow.
@@ -187,7 +168,7 @@ def draw_track(
             _add_line(opacity, fixed[index - 1], fixed[index], thickness, value)
     drawn = _paint(image, opacity, colour)
     if len(points) and valid[-1]:
-        centre = (int(fixed[-1][0]), int(fixed[-1][1]))
+        centre = fixed[-1].tolist()
         # The dark rim lies outside only: what is in the ring stays to be seen.
         rim = radius * 16 + 8 * thickness + 8
         cv2.circle(drawn, centre, rim, BLACK, 1, cv2.LINE_AA, shift=4)
@@ -196,14 +177,9 @@ def draw_track(
 
 
 def put_caption(image: np.ndarray, text: str) -> np.ndarray:
-    """Write one line at the lower left, white with a dark rim, sized to the image.
-
-    Returns:
-        A new image.
-    """
-    height, width = image.shape[:2]
+    """Write one line at the lower left, white with a dark rim, sized to the image."""
+    (height, width), font = image.shape[:2], cv2.FONT_HERSHEY_SIMPLEX
     scale = max(height / 700, 0.35)
-    font = cv2.FONT_HERSHEY_SIMPLEX
     margin = round(12 * scale) + 4
     text_width = cv2.getTextSize(text, font, scale, 1)[0][0]
     if text_width > width - 2 * margin > 0:
@@ -236,9 +212,7 @@ def _add_line(
         return
     region = opacity[low[1] : high[1], low[0] : high[0]]
     line = np.zeros_like(region)
-    shift = low * 16
-    first = (int(start[0] - shift[0]), int(start[1] - shift[1]))
-    last = (int(end[0] - shift[0]), int(end[1] - shift[1]))
+    first, last = (start - low * 16).tolist(), (end - low * 16).tolist()
     cv2.line(line, first, last, value, thickness, cv2.LINE_AA, shift=4)
     np.maximum(region, line, out=region)
 
@@ -246,31 +220,23 @@ def _add_line(
 def write_preview(path: Path, episodes: Sequence[Path]) -> None:
     """Write one H.264 video of some episodes, one after the other, with a progress bar.
 
-    Args:
-        path: of the video, ``....mp4``.
-        episodes: files.
-
     Raises:
         RequestError: an episode is damaged or of another model, or there is no OpenGL.
     """
     steps = [int(read_metadata(episode)["num_steps"]) for episode in episodes]
     frames = sum(-(-count // FRAME_STEPS) for count in steps)
-    with (
-        VideoWriter(path, FPS) as video,
-        tqdm(total=frames, unit="frame", desc=path.name) as progress,
-    ):
-        for episode in episodes:
-            for frame in preview_frames(episode):
-                video.write(frame)
-                progress.update()
+    _write_frames(path, chain.from_iterable(map(preview_frames, episodes)), frames)
+
+
+def _write_frames(path: Path, frames: Iterable[np.ndarray], total: int) -> None:
+    with VideoWriter(path, FPS) as video:
+        for frame in tqdm(frames, path.name, total, unit="frame", mininterval=1.0):
+            video.write(frame)
 
 
 def preview_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
     """Replay an episode and draw it; yield (H, 3 W, 3) uint8 frames."""
-    with (
-        EpisodeReader(path) as episode,
-        closing(remake_env(episode, cameras=(), **LOOK)) as env,
-    ):
+    with EpisodeReader(path) as episode, closing(remake_env(episode, cameras=(), **LOOK)) as env:
         world = world_of(env)
         target = episode.array(world.task.target_field)[:, 0]
         names, phases = episode.attributes["phase_names"], episode.array("phase")
@@ -304,28 +270,15 @@ def video_name(result: EpisodeResult) -> str:
 
 
 def write_video(path: Path, config: EnvConfig, result: EpisodeResult, recording: Recording) -> None:
-    """Write an H.264 video of an episode.
-
-    Args:
-        path: of the video, ``....mp4``.
-        config: of the environment in which the policy acted.
-        result: of the episode.
-        recording: its observations and actions.
+    """Write an H.264 video of an episode of a policy, in the environment in which it acted.
 
     Raises:
         RequestError: there is no OpenGL.
         RuntimeError: the replayed episode ends otherwise than recorded.
     """
     last = len(recording.actions) - 1
-    frames = last // FRAME_STEPS + 1 + (last % FRAME_STEPS > 0)
-    frame = None
-    with VideoWriter(path, FPS) as video:
-        drawn = video_frames(config, result, recording)
-        for frame in tqdm(drawn, total=frames, unit="frame", desc=path.name, mininterval=1.0):
-            video.write(frame)
-        if frame is not None:
-            for _ in range(round(HOLD_SECONDS * FPS)):
-                video.write(frame)
+    frames = last // FRAME_STEPS + 1 + (last % FRAME_STEPS > 0) + HOLD_FRAMES
+    _write_frames(path, video_frames(config, result, recording), frames)
 
 
 def video_frames(
@@ -335,7 +288,7 @@ def video_frames(
 
     The three cameras stand side by side, then the surroundings of the target, enlarged. Yellow is
     the true target with its past; cyan are the present and predicted positions that the policy
-    observed.
+    observed. The last frame is repeated for a second.
     """
     title = f"{result.policy} {result.condition}, seed {result.seed}".strip()
     last = len(recording.actions) - 1
@@ -344,15 +297,16 @@ def video_frames(
         world.renders_images = False  # of the policy's own cameras
         _, info = env.reset(seed=result.seed)
         track: list[NDArray[np.float64]] = []
-        for step, (vector, action) in enumerate(
-            zip(recording.vectors, recording.actions, strict=True)
-        ):
+        steps = zip(recording.vectors, recording.actions, strict=True)
+        for step, (vector, action) in enumerate(steps):
             track = [*track[-TRACK_STEPS:], world.target_track()[0]]
             if step % FRAME_STEPS == 0 or step == last:
                 caption = f"{title}: {info['phase']}, {step * CONTROL_PERIOD:.1f} s"
                 if step == last:
                     caption += f"  {result.failure.replace('_', ' ') or 'SUCCESS'}"
-                yield _draw(world, np.array(track), config.spec.target_positions(vector), caption)
+                observed = config.spec.target_positions(vector)
+                frame = _draw(world, np.array(track), observed, caption)
+                yield from [frame] * (1 + HOLD_FRAMES if step == last else 1)
             _, _, _, _, info = env.step(action)
         if bool(info["is_success"]) != result.is_success:
             raise RuntimeError(f"seed {result.seed} ends otherwise than recorded")
@@ -362,10 +316,10 @@ def _draw(
     world: FaceEnv, track: NDArray[np.float64], observed: NDArray[np.float64], caption: str
 ) -> NDArray[np.uint8]:
     views = world.renderer.render(world.data, CAMERAS)
-    drawn = [
-        _dots(draw_track(views[c], _pixels(world, c, track)), _pixels(world, c, observed), 2)
-        for c in CAMERAS
-    ]
+    drawn = []
+    for camera in CAMERAS:
+        ringed = draw_track(views[camera], _pixels(world, camera, track))
+        drawn.append(_dots(ringed, _pixels(world, camera, observed), 2))
     # The surroundings of the target, enlarged to the size of the view.
     height, width = VIEW_SIZE
     line = _pixels(world, CLOSE_UP, track)

@@ -20,13 +20,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from types import TracebackType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     EpisodeMetrics,
     TaskEntry,
@@ -39,9 +39,6 @@ from robo_manip_baselines.runs.errors import RequestError
 
 _PATIENCE = 5.0
 """s for a worker to end by itself, when the run is over, before it is killed."""
-
-_ALIGNMENT = 64
-"""bytes; a cache line, so that no two arrays share one."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +71,19 @@ class EnvConfig:
         return (len(ARM_JOINTS) + 1) * len(self.spec.arm_names)
 
     @property
-    def image_shape(self) -> tuple[int, ...]:
-        """(N, H, W, 3) of the images of all cameras."""
-        return (len(self.spec.cameras), *self.spec.image_size, 3)
+    def row_type(self) -> np.dtype[Any]:
+        """Row of an environment in the shared memory.
+
+        ``vectors`` (S,) float32 is the packed observation, ``actions`` (A,) float32 the next
+        action, ``images`` (N, H, W, 3) uint8.
+        """
+        vectors = ("vectors", np.float32, (self.vector_size,))
+        actions = ("actions", np.float32, (self.action_size,))
+        images = ("images", np.uint8, (len(self.spec.cameras), *self.spec.image_size, 3))
+        return np.dtype([vectors, actions, images])
 
     def make(self, **changes: Any) -> gymnasium.Env[Any, Any]:
-        """Make the environment.
-
-        Args:
-            **changes: arguments that shall differ.
+        """Make the environment, with changes to its arguments.
 
         Raises:
             RequestError: an argument is not valid.
@@ -118,70 +119,15 @@ class StepResult(NamedTuple):
     result: EpisodeResult | None
 
 
-class SharedArrays:
-    """One row for each environment, laid out in one stretch of memory.
-
-    Args:
-        config: decides the sizes.
-        num_envs: n.
-        buffer: of ``size`` bytes, zeros; made here if None.
-
-    Attributes:
-        vectors: (n, S) float32, packed observations.
-        actions: (n, A) float32, the next action.
-        images: (n, N, H, W, 3) uint8.
-    """
-
-    def __init__(self, config: EnvConfig, num_envs: int, buffer: Any = None) -> None:
-        memory = bytearray(self.size(config, num_envs)) if buffer is None else buffer
-        parts, start = [], 0
-        for shape, kind in _layout(config, num_envs):
-            count = int(np.prod(shape))
-            parts.append(np.frombuffer(memory, kind, count, start).reshape(shape))
-            start += _padded(count * np.dtype(kind).itemsize)
-        self.vectors, self.actions, self.images = parts
-        self.num_envs = num_envs
-
-    @staticmethod
-    def size(config: EnvConfig, num_envs: int) -> int:
-        """Bytes that the arrays need."""
-        return sum(
-            _padded(int(np.prod(shape)) * np.dtype(kind).itemsize)
-            for shape, kind in _layout(config, num_envs)
-        )
-
-
-class EnvPool(Protocol):
-    """Environments, wherever they run."""
-
-    @property
-    def config(self) -> EnvConfig:
-        """Configuration of every environment."""
-        ...
-
-    @property
-    def arrays(self) -> SharedArrays:
-        """Inputs and outputs."""
-        ...
-
-    def submit(self, requests: Sequence[StepRequest]) -> None:
-        """Send requests to environments that have none."""
-        ...
-
-    def wait(self) -> list[StepResult]:
-        """Wait until some environments have answered, and return the answers."""
-        ...
-
-
 class LocalEnvs:
     """Environments in this process; made when first needed.
 
     Args:
         config: of every environment.
-        arrays: rows of these environments, and of others.
+        arrays: (n,) of ``config.row_type``, rows of these environments and of others.
     """
 
-    def __init__(self, config: EnvConfig, arrays: SharedArrays) -> None:
+    def __init__(self, config: EnvConfig, arrays: NDArray[np.void]) -> None:
         self.config, self.arrays = config, arrays
         self._envs: dict[int, gymnasium.Env[Any, Any]] = {}
         self._metrics: dict[int, EpisodeMetrics] = {}
@@ -211,39 +157,107 @@ class LocalEnvs:
         world = world_of(env)
         world.renders_images = needs_images
         if seed is None:
-            observation, _, terminated, truncated, info = env.step(self.arrays.actions[number])
+            observation, _, terminated, truncated, info = env.step(self.arrays["actions"][number])
             metrics = self._metrics[number]
             metrics.update(info)
             if terminated or truncated:
-                return StepResult(number, self._result(world, self._seeds[number], metrics, info))
+                (failure, columns), time = metrics.result(info), info["completion_time"]
+                result = EpisodeResult(
+                    env=self.config.env,
+                    seed=self._seeds[number],
+                    is_success=bool(info["is_success"]),
+                    is_success_strict=bool(info["is_success_strict"]),
+                    # Times are sums of 0.02 s; microseconds hide what floating point adds to them.
+                    completion_time=None if time is None else round(float(time), 6),
+                    steps=world.step_count,
+                    failure=failure,
+                    motion_clip=world.segment.clip,
+                    motion_subject=world.segment.subject,
+                    columns=columns,
+                )
+                return StepResult(number, result)
         else:
             observation, _ = env.reset(seed=seed)
             self._metrics[number] = self.config.task.make_metrics()
             self._seeds[number] = seed
-        self.arrays.vectors[number] = world.vector
+        self.arrays["vectors"][number] = world.vector
         if needs_images:
             for camera, key in enumerate(self.config.spec.image_keys()):
-                self.arrays.images[number, camera] = observation[key]
+                self.arrays["images"][number, camera] = observation[key]
         return StepResult(number, None)
 
-    def _result(
-        self, world: FaceEnv, seed: int, metrics: EpisodeMetrics, info: dict[str, Any]
-    ) -> EpisodeResult:
-        failure, columns = metrics.result(info)
-        time = info["completion_time"]
-        return EpisodeResult(
-            env=self.config.env,
-            seed=seed,
-            is_success=bool(info["is_success"]),
-            is_success_strict=bool(info["is_success_strict"]),
-            # Times are sums of 0.02 s; microseconds hide what floating point adds to them.
-            completion_time=None if time is None else round(float(time), 6),
-            steps=world.step_count,
-            failure=failure,
-            motion_clip=world.segment.clip,
-            motion_subject=world.segment.subject,
-            columns=columns,
-        )
+
+@dataclass
+class _Worker:
+    """Process, the pipe to it, and the requests that it is working on."""
+
+    process: Any
+    pipe: Connection
+    requests: Sequence[StepRequest] = ()
+
+
+class WorkerEnvs:
+    """Environments dealt out to worker processes."""
+
+    def __init__(self, config: EnvConfig, num_envs: int, workers: int) -> None:
+        self.config = config
+        # Spawned, not forked: an OpenGL context does not survive a fork.
+        context = multiprocessing.get_context("spawn")
+        buffer = context.RawArray("B", num_envs * config.row_type.itemsize)
+        self.arrays = np.frombuffer(buffer, config.row_type)
+        self._workers: list[_Worker] = []
+        try:
+            for _ in range(workers):
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_work, args=(theirs, config, buffer), daemon=True)
+                self._workers.append(_Worker(process, ours))
+                with _without_interrupts():
+                    process.start()
+                theirs.close()  # so that the pipe ends when the worker does
+        except BaseException:
+            self.close()
+            raise
+
+    def submit(self, requests: Sequence[StepRequest]) -> None:
+        """Send requests to environments that have none."""
+        for number, worker in enumerate(self._workers):
+            mine = [r for r in requests if r.env_id % len(self._workers) == number]
+            if mine:
+                worker.requests = mine
+                with contextlib.suppress(OSError):  # it has died; ``wait`` finds out why
+                    worker.pipe.send(mine)
+
+    def wait(self) -> list[StepResult]:
+        """Wait until some environments have answered, and return the answers.
+
+        Raises:
+            RequestError: a worker could not do what was requested.
+            RuntimeError: a worker failed or died.
+        """
+        busy = [worker for worker in self._workers if worker.requests]
+        ready = wait([worker.pipe for worker in busy])
+        answers: list[StepResult] = []
+        for worker in busy:
+            if worker.pipe in ready:
+                answers += _receive(worker)
+                worker.requests = ()
+        return answers
+
+    def close(self) -> None:
+        """End the workers."""
+        for worker in self._workers:
+            worker.pipe.close()  # a worker ends when it finds that its pipe has
+        for worker in self._workers:
+            if worker.process.pid is not None:
+                worker.process.join(_PATIENCE)
+                if worker.process.is_alive():
+                    worker.process.kill()
+                    worker.process.join()
+                worker.process.close()
+        self._workers.clear()
+
+
+EnvPool = LocalEnvs | WorkerEnvs
 
 
 @contextlib.contextmanager
@@ -262,100 +276,13 @@ def open_envs(config: EnvConfig, num_envs: int, workers: int) -> Iterator[EnvPoo
         raise RequestError(f"num_envs {num_envs}: must be 1 or more")
     if workers < 0:
         raise RequestError(f"workers {workers}: must be 0 (no process of their own) or more")
-    if workers:
-        with WorkerEnvs(config, num_envs, min(workers, num_envs)) as envs:
-            yield envs
-    else:
-        with contextlib.closing(LocalEnvs(config, SharedArrays(config, num_envs))) as here:
-            yield here
-
-
-@dataclass
-class _Worker:
-    """Process, the pipe to it, and the requests that it is working on."""
-
-    process: Any
-    pipe: Connection
-    requests: Sequence[StepRequest] = ()
-
-
-class WorkerEnvs:
-    """Environments dealt out to worker processes. Use as a context manager.
-
-    Args:
-        config: of every environment.
-        num_envs: n.
-        workers: processes.
-    """
-
-    def __init__(self, config: EnvConfig, num_envs: int, workers: int) -> None:
-        self.config = config
-        # Spawned, not forked: an OpenGL context does not survive a fork.
-        context = multiprocessing.get_context("spawn")
-        buffer = context.RawArray("B", SharedArrays.size(config, num_envs))
-        self.arrays = SharedArrays(config, num_envs, buffer)
-        self._workers: list[_Worker] = []
-        try:
-            for _ in range(workers):
-                ours, theirs = context.Pipe()
-                process = context.Process(
-                    target=_work, args=(theirs, config, num_envs, buffer), daemon=True
-                )
-                self._workers.append(_Worker(process, ours))
-                with _without_interrupts():
-                    process.start()
-                theirs.close()  # so that the pipe ends when the worker does
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> WorkerEnvs:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def submit(self, requests: Sequence[StepRequest]) -> None:
-        """Send requests to environments that have none."""
-        for number, worker in enumerate(self._workers):
-            mine = [r for r in requests if r.env_id % len(self._workers) == number]
-            if mine:
-                worker.requests = mine
-                with contextlib.suppress(OSError):  # it has died; ``wait`` finds out why
-                    worker.pipe.send(mine)
-
-    def wait(self) -> list[StepResult]:
-        """Wait until some environments have answered, and return the answers.
-
-        Raises:
-            RequestError: a worker could not do what was requested.
-            RuntimeError: a worker failed or died.
-        """
-        busy = {worker.pipe: worker for worker in self._workers if worker.requests}
-        answers: list[StepResult] = []
-        for pipe in wait(list(busy)):
-            worker = busy[pipe]  # type: ignore[index]
-            answers += _receive(worker)
-            worker.requests = ()
-        return answers
-
-    def close(self) -> None:
-        """End the workers."""
-        for worker in self._workers:
-            worker.pipe.close()  # a worker ends when it finds that its pipe has
-        for worker in self._workers:
-            if worker.process.pid is not None:
-                worker.process.join(_PATIENCE)
-                if worker.process.is_alive():
-                    worker.process.kill()
-                    worker.process.join()
-                worker.process.close()
-        self._workers.clear()
+    envs = (
+        WorkerEnvs(config, num_envs, min(workers, num_envs))
+        if workers
+        else LocalEnvs(config, np.zeros(num_envs, config.row_type))
+    )
+    with contextlib.closing(envs):
+        yield envs
 
 
 def _receive(worker: _Worker) -> list[StepResult]:
@@ -377,11 +304,10 @@ def _receive(worker: _Worker) -> list[StepResult]:
     return answer
 
 
-def _work(pipe: Connection, config: EnvConfig, num_envs: int, buffer: Any) -> None:
+def _work(pipe: Connection, config: EnvConfig, buffer: Any) -> None:
     """Carry out requests until the pipe ends; errors are reported through it."""
     answer: list[StepResult] | RequestError | str
-    arrays = SharedArrays(config, num_envs, buffer)
-    with contextlib.closing(LocalEnvs(config, arrays)) as here:
+    with contextlib.closing(LocalEnvs(config, np.frombuffer(buffer, config.row_type))) as here:
         while True:
             try:
                 requests = pipe.recv()
@@ -417,15 +343,3 @@ def _without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _layout(config: EnvConfig, num_envs: int) -> list[tuple[tuple[int, ...], Any]]:
-    return [
-        ((num_envs, config.vector_size), np.float32),
-        ((num_envs, config.action_size), np.float32),
-        ((num_envs, *config.image_shape), np.uint8),
-    ]
-
-
-def _padded(size: int) -> int:
-    return -(-size // _ALIGNMENT) * _ALIGNMENT

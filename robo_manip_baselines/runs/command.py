@@ -143,6 +143,24 @@ def parse(
     return result
 
 
+def last_value(args: Sequence[str], name: str) -> str | None:
+    """Return the value of an option that decides the defaults of others, before `parse`.
+
+    Args:
+        args: the command line.
+        name: of the option, with underscores.
+
+    Returns:
+        What follows the last ``--name`` or ``--name=``; None where there is no value.
+    """
+    found = None
+    for arg, following in zip(args, [*args, "--"][1:], strict=True):
+        option, sign, value = arg.partition("=")
+        if option.startswith("--") and option[2:].replace("-", "_") == name:
+            found = value if sign else None if following.startswith("--") else following
+    return found
+
+
 def _call_tyro(
     options_type: Any, description: str, args: Sequence[str], default: Any, prog: str
 ) -> tuple[Any, list[str]]:

@@ -1,7 +1,10 @@
-"""Training batches: made ahead by threads, in main memory or on a CUDA device.
+"""Training batches: sampled, and made ahead by threads in main memory or on a CUDA device.
 
-Legend: R steps of the training episodes, b examples, O observation steps, S elements of the state,
-A elements of an action, K actions of a chunk, N cameras, H and W image height and width.
+Examples and noise of each step are functions of the seed and of the step, nothing else.
+
+Legend: E training episodes, R steps of them, b examples of a step, O observation steps, S elements
+of the state, A elements of an action, K actions of a chunk, N cameras, H and W image height and
+width.
 """
 
 from __future__ import annotations
@@ -10,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import fields
 
 import numpy as np
 import torch
@@ -19,22 +21,161 @@ from torch import Tensor
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.normalization import Normalization
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings, require_at_least
+from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.images import ImageStore
-from robo_manip_baselines.training.sampling import (
-    ExampleSampler,
-    StateNoise,
-    chunk_rows,
-    step_noise,
-    window_rows,
-)
 
 UPLOAD = 64
 """Steps whose images are copied to a GPU at a time: 177 MB with three of 480x640."""
 
 WORKERS = 2
 """Batches made at a time: while the last images of one are decoded, the next has begun."""
+
+
+Indices = NDArray[np.int64]
+
+
+class ExampleSampler:
+    """Sampler without state, so that training can be resumed at any step.
+
+    With the sampler ``episode`` (the paper's) an epoch draws one start from each episode, uniform
+    over its steps; with ``frame`` an epoch visits every step of every episode once. Either way
+    the order is random and another in each epoch. Epochs follow one another without a seam: every
+    batch is full, and one may hold the end of an epoch and the beginning of the next. So 2000
+    epochs of 50 episodes in batches of 8 (paper, Table III) are 12 500 steps.
+
+    Attributes:
+        lengths: (E,) int64, steps of each training episode.
+        sampler, batch_size, seed: as given.
+        frames_per_epoch: examples of an epoch.
+
+    Raises:
+        RequestError: unknown sampler, batch size below 1, a negative seed, or no episodes.
+    """
+
+    def __init__(
+        self, lengths: Sequence[int] | Indices, sampler: str, batch_size: int, seed: int
+    ) -> None:
+        self.lengths = np.asarray(lengths, dtype=np.int64)
+        self.sampler = require_choice("sampler", sampler, SAMPLERS)
+        self.batch_size = batch_size
+        self.seed = seed
+        require_at_least(1, self, "batch_size")
+        require_at_least(0, self, "seed")
+        if self.lengths.ndim != 1 or not self.lengths.size or self.lengths.min() < 1:
+            raise RequestError("training needs at least one episode, each of at least one step")
+        by_episode = sampler == "episode"
+        self.frames_per_epoch = len(self.lengths) if by_episode else int(self.lengths.sum())
+        self._epochs: dict[int, Indices] = {}
+
+    def epochs(self, steps: int) -> float:
+        """Return the number of epochs in so many steps."""
+        return steps * self.batch_size / self.frames_per_epoch
+
+    def total_steps(self, settings: TrainSettings) -> int:
+        """Return the budget in optimiser steps; the last batch is full."""
+        if settings.steps is not None:
+            return settings.steps
+        assert settings.epochs is not None  # TrainSettings takes exactly one of the two
+        return -(-settings.epochs * self.frames_per_epoch // self.batch_size)
+
+    def batch(self, step: int) -> Indices:
+        """Return the examples of a step, (b, 2): index of the training episode, first step in it.
+
+        Raises:
+            ValueError: a negative step.
+        """
+        if step < 0:
+            raise ValueError(f"step {step}: must be 0 or more")
+        numbers = np.arange(step * self.batch_size, (step + 1) * self.batch_size)
+        epochs, places = np.divmod(numbers, self.frames_per_epoch)
+        parts = [self._epoch(int(e))[places[epochs == e]] for e in np.unique(epochs)]
+        return np.concatenate(parts)
+
+    def _epoch(self, epoch: int) -> Indices:
+        """Return all examples of an epoch in their order; two epochs are cached."""
+        if (cached := self._epochs.get(epoch)) is not None:
+            return cached
+        rng = np.random.default_rng(derive_seed(self.seed, "schedule", epoch))
+        if self.sampler == "episode":
+            episodes = rng.permutation(len(self.lengths))
+            starts = rng.integers(0, self.lengths[episodes])
+        else:
+            first = np.concatenate([[0], np.cumsum(self.lengths)])
+            frames = rng.permutation(self.frames_per_epoch)
+            episodes = np.searchsorted(first, frames, side="right") - 1
+            starts = frames - first[episodes]
+        examples = np.stack([episodes, starts], axis=1).astype(np.int64, copy=False)
+        # Replaced, not changed: another thread may be reading it. Two, for batches on a seam.
+        self._epochs = {number: self._epochs[number] for number in list(self._epochs)[-1:]}
+        self._epochs[epoch] = examples
+        return examples
+
+
+def chunk_rows(
+    offsets: Indices, episodes: Indices, starts: Indices, chunk_size: int
+) -> tuple[Indices, NDArray[np.bool_]]:
+    """Return the rows of chunks of actions; past the end of an episode its last row is repeated.
+
+    Args:
+        offsets: (E + 1,) row at which each episode begins, and the number of rows.
+        episodes: (b,) index of each example's episode.
+        starts: (b,) step of each example within its episode.
+        chunk_size: K.
+
+    Returns:
+        (b, K) rows, and (b, K) whether each is padding.
+    """
+    rows = (offsets[episodes] + starts)[:, None] + np.arange(chunk_size)
+    end = offsets[episodes + 1][:, None]
+    return np.minimum(rows, end - 1), rows >= end
+
+
+def window_rows(offsets: Indices, episodes: Indices, starts: Indices, n_obs_steps: int) -> Indices:
+    """Return the rows (b, O) of windows of observations that end with each example's step.
+
+    Before the start of an episode its first row is repeated. Arguments as in `chunk_rows`.
+    """
+    first = offsets[episodes][:, None]
+    rows = first + starts[:, None] + np.arange(1 - n_obs_steps, 1)
+    return np.maximum(rows, first)
+
+
+def step_noise(seed: int, stream: str, step: int, count: int, size: int) -> Tensor:
+    """Return (count, size) standard normal numbers, a function of seed, stream and step."""
+    generator = torch.Generator().manual_seed(derive_seed(seed, stream, step))
+    return torch.randn(count, size, generator=generator)
+
+
+class StateNoise:
+    """Gaussian noise on normalised states: on proprioception and on the clock.
+
+    Mouth and cube are left as they are. ``robot`` is ``TrainSettings.state_noise``, ``clock``
+    ``TrainSettings.clock_noise``.
+    """
+
+    def __init__(
+        self, spec: ObservationSpec, names: ObservedNames, robot: float = 0.0, clock: float = 0.0
+    ) -> None:
+        elements = spec.vector_names(names)
+        self._size = len(elements)
+        self._robot_size = len(spec.components(names)["state"])  # they come first
+        self._times = [i for i, name in enumerate(elements) if name.startswith("t_")]
+        self._robot, self._clock = robot, clock
+
+    def draw(self, seed: int, step: int, count: int) -> Tensor | None:
+        """Return (count, S) for a step; None where there is no noise."""
+        if not self._robot and not (self._clock and self._times):
+            return None
+        drawn = step_noise(seed, "state", step, count, self._robot_size + 1)
+        noise = torch.zeros(count, self._size)
+        noise[:, : self._robot_size] = self._robot * drawn[:, : self._robot_size]
+        # One clock: all times of an observation are off by the same.
+        noise[:, self._times] = self._clock * drawn[:, self._robot_size :]
+        return noise
 
 
 def part_of(count: int, rank: int, world_size: int) -> slice:
@@ -151,12 +292,11 @@ class BatchLoader:
         chunks, is_pad = chunk_rows(self._offsets, episodes, starts, self._model.chunk_size)
         windows = window_rows(self._offsets, episodes, starts, n_obs_steps)
         noise = step_noise(self._seed, "noise", step, count, self._model.noise_size)
+        part = part_of(count, self._rank, self._world_size)
         state_noise: Tensor | None = None
         if self._state_noise:
-            state_noise = self._state_noise.draw(self._seed, step, count * n_obs_steps)
-        part = part_of(count, self._rank, self._world_size)
-        if state_noise is not None:
-            state_noise = state_noise.view(count, n_obs_steps, -1)[part]
+            drawn = self._state_noise.draw(self._seed, step, count * n_obs_steps)
+            state_noise = None if drawn is None else drawn.view(count, n_obs_steps, -1)[part]
         gather = self._gather if self._stream is None else self._gather_on_device
         # All processes divide by the same number, the mean over the processes.
         return gather(
@@ -248,8 +388,7 @@ def _received(batch: Batch, ready: torch.cuda.Event | None) -> Batch:
     if ready is not None:
         stream = torch.cuda.current_stream(batch.state.device)
         stream.wait_event(ready)
-        for field in fields(batch):
-            tensor = getattr(batch, field.name)
+        for tensor in vars(batch).values():
             if tensor is not None:
                 # Allocated on another stream: it must not be reused before this one is done.
                 tensor.record_stream(stream)

@@ -18,7 +18,12 @@ import yaml
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.spec import parse_image_size
-from robo_manip_baselines.policy.presets import ActionExecution, TrainSettings, require_at_least
+from robo_manip_baselines.policy.presets import (
+    ActionExecution,
+    TrainSettings,
+    require_at_least,
+    with_tuples,
+)
 from robo_manip_baselines.policy.registry import policy_presets
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_text
@@ -95,11 +100,15 @@ class TrainConfig(Generic[Network]):
         require_at_least(0, self, "seed")
 
     @classmethod
-    def from_preset(cls, policy: str, preset: str, **changes: Any) -> TrainConfig[Any]:
+    def from_preset(
+        cls, policy: str, preset: str, env: str = "FeedingEnv", **changes: Any
+    ) -> TrainConfig[Any]:
         """Return the defaults of a preset, with changes to attributes of the configuration.
 
+        A preset's ``object_pose`` applies only where the task has objects.
+
         Raises:
-            RequestError: there is no such policy or preset, or a value is not valid.
+            RequestError: there is no such policy, preset or task, or a value is not valid.
         """
         presets = policy_presets(policy)
         chosen = presets[require_choice("preset", preset, presets)]
@@ -107,9 +116,9 @@ class TrainConfig(Generic[Network]):
             obs="current_pred",
             cameras=chosen.cameras,
             image_size=chosen.image_size,
-            object_pose=chosen.object_pose,
+            object_pose=chosen.object_pose and bool(task_entry(env).names.objects),
         )
-        config = cls(policy, chosen.config, chosen.training, spec, preset=preset)
+        config = cls(policy, chosen.config, chosen.training, spec, env, preset=preset)
         return dataclasses.replace(config, **changes)
 
     @property
@@ -117,8 +126,7 @@ class TrainConfig(Generic[Network]):
         """Run folder."""
         if self.out is not None:
             return self.out
-        name = f"{self.policy.lower()}_{self.spec.name}_{self.preset}_seed{self.seed}"
-        return Path("runs") / name
+        return Path(f"runs/{self.policy.lower()}_{self.spec.name}_{self.preset}_seed{self.seed}")
 
     @property
     def demonstrations(self) -> Path:
@@ -147,22 +155,20 @@ class TrainConfig(Generic[Network]):
         Raises:
             RequestError: a name or a value that is not valid.
         """
-        default = cls.from_preset(values.get("policy", ""), values.get("preset", "cpu"))
+        env = values.get("env", cls.env)
+        default = cls.from_preset(values.get("policy", ""), values.get("preset", "cpu"), env)
         known = [*default.to_json(), "corruption"]
         for name in values:
             require_choice("option", name, known)
-        given: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in values.items()
-        }
+        given = with_tuples(values)
         for name in ("dataset", "out"):
             given[name] = Path(given[name]) if given.get(name) else None
         if "image_size" in given:
             given["image_size"] = parse_image_size(given["image_size"])
-        corruption = {of: given[name] for name, of in _CORRUPTION.items() if name in given}
         is_on = given.pop("corruption", True) is not False  # --no_corruption of older releases
-        chosen = {of: value for of, value in corruption.items() if value is not None and is_on}
-        given["corruption"] = Corruption(**chosen)
+        names = _CORRUPTION.items() if is_on else ()
+        corruption = {of: given[name] for name, of in names if given.get(name) is not None}
+        given["corruption"] = Corruption(**corruption)
 
         def changed(part: Any) -> Any:
             names = {item.name for item in fields(part)} & given.keys()
@@ -209,9 +215,8 @@ def require_same_config(run: Path, config: TrainConfig[Any]) -> None:
         raise RequestError(f"'{run / CONFIG}': {error}; choose another --out") from error
     for name, value in config.to_json().items():
         if name not in RUNTIME_OPTIONS and value != before.get(name):
-            old, new = (
-                " ".join(map(str, v)) if isinstance(v, list) else v for v in (before[name], value)
-            )
+            pair = before[name], value
+            old, new = (" ".join(map(str, v)) if isinstance(v, list) else v for v in pair)
             raise RequestError(
                 f"'{run}' holds a run with {name} {old}, not {new}; "
                 "choose another --out, or give the same options"

@@ -22,9 +22,7 @@ DEVICE_TYPES = ("cpu", "cuda")
 def choose_device(given: str, local_rank: int = 0) -> torch.device:
     """Return the device of ``--device``; ``auto`` is a GPU where there is one.
 
-    Args:
-        given: ``auto``, ``cpu``, ``cuda`` or ``cuda:1``.
-        local_rank: number of this process on its machine, which is the number of its GPU.
+    ``local_rank``, the number of this process on its machine, is the number of its GPU.
 
     Raises:
         RequestError: there is no such device.
@@ -170,8 +168,7 @@ class Processes:
         Raises:
             RequestError: it is set in part only.
         """
-        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
-        values = [os.environ.get(name) for name in names]
+        values = [os.environ.get(name) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK")]
         if values[0] is None and values[1] in (None, "1"):
             return cls()
         if None in values or "MASTER_ADDR" not in os.environ:

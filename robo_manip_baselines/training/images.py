@@ -87,11 +87,7 @@ class ImageStore(AbstractContextManager["ImageStore"]):
         self.close()
 
     def images(self, rows: NDArray[np.int64], out: Images | None = None) -> Images:
-        """Return the images (b, N, H, W, 3) of (b,) steps.
-
-        Args:
-            rows: places among the R steps of the demonstrations.
-            out: array to write them to.
+        """Return the images (b, N, H, W, 3) of (b,) rows among the R steps, written to ``out``.
 
         Raises:
             IndexError: there is no such step.
@@ -106,12 +102,12 @@ class ImageStore(AbstractContextManager["ImageStore"]):
             return images
         episodes = np.searchsorted(self._offsets, rows, side="right") - 1
         decoded = []
-        for place, (row, episode) in enumerate(zip(rows, episodes, strict=True)):
+        for row, episode, views in zip(rows, episodes, images, strict=True):
             step = int(row - self._offsets[episode])
-            for index, camera in enumerate(self._cameras):
+            for camera, view in zip(self._cameras, views, strict=True):
                 with self._reading:  # HDF5 itself reads one thing at a time
                     data = self._reader(int(episode)).encoded_frame(camera, step)
-                arguments = (data, images[place, index], self._paths[episode], camera, step)
+                arguments = data, view, self._paths[episode], camera, step
                 decoded.append(self._pool.submit(_decode, *arguments))
         for future in decoded:
             future.result()

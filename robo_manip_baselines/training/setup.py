@@ -29,6 +29,7 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import MetricsLog, open_board
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.runs.versions import software_versions
+from robo_manip_baselines.training.batching import ExampleSampler
 from robo_manip_baselines.training.config import (
     CONFIG,
     METRICS,
@@ -36,7 +37,6 @@ from robo_manip_baselines.training.config import (
     require_same_config,
     write_config,
 )
-from robo_manip_baselines.training.sampling import ExampleSampler
 
 
 @dataclass(frozen=True)
@@ -67,38 +67,26 @@ class TrainSetup:
             RequestError: there are none, or they do not fit the configuration.
         """
         settings, seed = config.training, config.seed
-        given = load_demonstrations(
-            config.demonstrations, config.spec, limit=config.num_episodes, env=config.env
-        )
-        env_id = task_entry(config.env).env_id
+        folder, env_id = config.demonstrations, task_entry(config.env).env_id
+        given = load_demonstrations(folder, config.spec, limit=config.num_episodes, env=config.env)
         if given.env_id != env_id:
-            raise RequestError(f"'{config.demonstrations}' holds {given.env_id}, not {env_id}")
+            raise RequestError(f"'{folder}' holds {given.env_id}, not {env_id}")
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
-        train = given.indices(split.train)
+        train = list(given.indices(split.train))
         rows = given.rows(train)
         method = policy_entry(config.policy).normalization
         normalize = METHODS.get(method) or load_part(method)
-        sampler = ExampleSampler(
-            given.lengths[list(train)], settings.sampler, settings.batch_size, seed
-        )
-        return cls(
-            config,
-            given,
-            split,
-            normalize(given.state[rows], given.action[rows]),
-            sampler,
-            sampler.total_steps(settings),
-        )
+        normalization = normalize(given.state[rows], given.action[rows])
+        lengths = given.lengths[train]
+        sampler = ExampleSampler(lengths, settings.sampler, settings.batch_size, seed)
+        return cls(config, given, split, normalization, sampler, sampler.total_steps(settings))
 
     @property
     def dims(self) -> PolicyDims:
         """Dimensions of the network's inputs and outputs."""
-        return PolicyDims(
-            state=self.demonstrations.state.shape[1],
-            action=self.demonstrations.action.shape[1],
-            cameras=len(self.demonstrations.spec.cameras),
-            image=self.demonstrations.spec.image_size,
-        )
+        given, spec = self.demonstrations, self.demonstrations.spec
+        sizes = given.state.shape[1], given.action.shape[1]
+        return PolicyDims(*sizes, cameras=len(spec.cameras), image=spec.image_size)
 
     def make_model(self, *, initial_weights: bool = True) -> PolicyModel:
         """Build the network; the seed decides its random weights.
@@ -153,10 +141,10 @@ class TrainSetup:
         checkpoint = read_checkpoint(run)
         if not resume:
             done = checkpoint.step >= self.total_steps
-            raise RequestError(
-                f"'{run}' holds this run, {'finished' if done else f'at step {checkpoint.step}'}; "
-                + ("choose another --out or --seed" if done else "--resume continues it")
-            )
+            state = "finished; choose another --out or --seed"
+            if not done:
+                state = f"at step {checkpoint.step}; --resume continues it"
+            raise RequestError(f"'{run}' holds this run, {state}")
         if checkpoint.dataset["content_hash"] != self.demonstrations.content_hash:
             raise RequestError(
                 f"the demonstrations in '{self.config.demonstrations}' are not the ones that "

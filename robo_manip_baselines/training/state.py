@@ -1,4 +1,6 @@
-"""State of a trainer: saved and restored exactly, so that resuming changes nothing.
+"""State of a trainer: network, optimiser and moving average.
+
+It is saved and restored exactly, so that resuming changes nothing.
 
 Beside the evaluated weights a checkpoint has tensors named ``weights/NAME`` (the trained weights,
 only where an average is evaluated), ``exp_avg/NAME`` and ``exp_avg_sq/NAME`` (AdamW), and
@@ -7,6 +9,8 @@ only where an average is evaluated), ``exp_avg/NAME`` and ``exp_avg_sq/NAME`` (A
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -17,9 +21,69 @@ from torch import Tensor, nn
 from robo_manip_baselines.policy.checkpoint import MODEL, Checkpoint, read_trainer
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import TrainSettings
-from robo_manip_baselines.training.optim import WeightAverage, make_optimizer
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def make_optimizer(model: PolicyModel, settings: TrainSettings) -> torch.optim.AdamW:
+    """Make AdamW over the policy's parameter groups, fused where the device has it."""
+    fused, rate = next(model.parameters()).device.type in ("cpu", "cuda"), settings.learning_rate
+    groups: Any = model.parameter_groups(rate)
+    optimizer = torch.optim.AdamW(groups, lr=rate, weight_decay=settings.weight_decay, fused=fused)
+    for group in optimizer.param_groups:
+        group["initial_lr"] = group["lr"]
+    return optimizer
+
+
+def learning_rate_factor(step: int, total_steps: int, settings: TrainSettings) -> float:
+    """Return the factor of the learning rate at a step, counted from 0.
+
+    The warm-up rises linearly and reaches 1 at step ``warmup_steps``; ``cosine`` then falls from 1
+    to 0, which it would reach one step after the last.
+    """
+    if step < settings.warmup_steps:
+        return (step + 1) / (settings.warmup_steps + 1)
+    if settings.schedule == "constant":
+        return 1.0
+    length = max(total_steps - settings.warmup_steps, 1)
+    progress = min((step - settings.warmup_steps) / length, 1.0)
+    return 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, factor: float) -> None:
+    """Set every group to its own initial learning rate times ``factor``."""
+    for group in optimizer.param_groups:
+        group["lr"] = group["initial_lr"] * factor
+
+
+class WeightAverage:
+    """Exponential moving average of a network's weights.
+
+    The decay of step n (from 0 on) is min(decay, (1 + n) / (10 + n)), as is usual, so that the
+    random initial weights are soon forgotten; it depends on the step alone.
+
+    Attributes:
+        model: a copy of the network with the averaged weights.
+    """
+
+    def __init__(self, model: PolicyModel, decay: float) -> None:
+        self.model = copy.deepcopy(model).eval().requires_grad_(False)
+        self._decay, self._source = decay, model
+        averages: list[Tensor] = list(self.model.parameters())
+        weights: list[Tensor] = list(model.parameters())
+        self._pairs = averages, weights
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        """Include the weights after a step; no host synchronisation."""
+        decay = min(self._decay, (1 + step) / (10 + step))
+        torch._foreach_lerp_(*self._pairs, 1.0 - decay)  # pyright: ignore[reportPrivateImportUsage]
+
+    @torch.no_grad()
+    def copy_buffers(self) -> None:
+        """Copy buffers, such as running statistics, from the network."""
+        for own, source in zip(self.model.buffers(), self._source.buffers(), strict=True):
+            own.copy_(source)
 
 
 class RunningMean:
@@ -58,12 +122,8 @@ class RunningMean:
 class TrainerState:
     """Everything that a training step changes.
 
-    Args:
-        model: on its device already; changed by training.
-        settings: of the optimiser and the average.
-
     Attributes:
-        model: the trained network.
+        model: the trained network, on its device already when given.
         optimizer: AdamW.
         average: moving average of the weights, or None.
         losses: means since they were last written.
@@ -93,9 +153,7 @@ class TrainerState:
     def state_dict(self, step: int, seconds: float) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return what `restore` needs beside the evaluated weights, as tensors and as JSON.
 
-        Args:
-            step: optimiser steps done.
-            seconds: spent on them.
+        The optimiser has done ``step`` steps in so many seconds.
         """
         tensors: dict[str, Tensor] = {}
         if self.average:
@@ -113,10 +171,7 @@ class TrainerState:
 
     @torch.no_grad()
     def restore(self, checkpoint: Checkpoint) -> float:
-        """Restore the state of a checkpoint of the same network and settings.
-
-        Returns:
-            Seconds spent until then.
+        """Restore a checkpoint of the same network and settings; return the seconds spent so far.
 
         Raises:
             RequestError: the checkpoint lacks the trainer's state, or it is damaged.
@@ -125,23 +180,19 @@ class TrainerState:
         tensors, json = read_trainer(checkpoint)
         if self.average:
             self.average.model.load_state_dict(weights)
-            weights = {
-                name.removeprefix("weights/"): tensor
-                for name, tensor in tensors.items()
-                if name.startswith("weights/")
-            }
+            prefix = "weights/"
+            weights = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
         self.model.load_state_dict(weights)
         fused = bool(self.optimizer.defaults["fused"])
         for name, parameter in self._named():
             if name not in json["optimizer_steps"]:
                 continue
-            # In the memory layout of the parameter, as AdamW itself makes them.
-            moments = {
-                m: torch.empty_like(parameter).copy_(tensors[f"{m}/{name}"]) for m in _MOMENTS
-            }
             device = parameter.device if fused else "cpu"
             count = torch.tensor(float(json["optimizer_steps"][name]), device=device)
-            self.optimizer.state[parameter] = {"step": count, **moments}
+            self.optimizer.state[parameter] = {"step": count}
+            for moment in _MOMENTS:  # in the memory layout of the parameter, as AdamW makes them
+                value = torch.empty_like(parameter).copy_(tensors[f"{moment}/{name}"])
+                self.optimizer.state[parameter][moment] = value
         self.losses.names = tuple(json["metrics"]["names"])
         self.losses.count = json["metrics"]["count"]
         if self.losses.count:

@@ -1,4 +1,4 @@
-"""The training loop."""
+"""The training loop, and the loss on the episodes held out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import derive_seed
-from robo_manip_baselines.training.batching import BatchLoader
+from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise
 from robo_manip_baselines.training.config import CURVES, METRICS, TrainConfig
 from robo_manip_baselines.training.device import (
     Processes,
@@ -35,13 +35,17 @@ from robo_manip_baselines.training.device import (
     prepare_device,
 )
 from robo_manip_baselines.training.images import ImageStore, free_memory
-from robo_manip_baselines.training.optim import learning_rate_factor, set_learning_rate
-from robo_manip_baselines.training.sampling import StateNoise
 from robo_manip_baselines.training.setup import TrainSetup
-from robo_manip_baselines.training.state import TrainerState
-from robo_manip_baselines.training.validation import HeldOutLoss
+from robo_manip_baselines.training.state import (
+    TrainerState,
+    learning_rate_factor,
+    set_learning_rate,
+)
 
 KEPT_CHECKPOINTS = 2
+
+HELD_OUT_STARTS = 8
+"""Examples of each episode: enough for a smooth curve, little of training's time."""
 
 _STEPS_BETWEEN_VOTES = 10
 """On several GPUs, steps between asking whether any process is to stop: asking waits."""
@@ -55,12 +59,8 @@ def train(config: TrainConfig[Any], *, resume: bool = False) -> int:
     Writes the run folder, ``config.folder``: options, checkpoints, metrics and their curves. Under
     ``torchrun`` every process calls this.
 
-    Args:
-        config: of the run.
-        resume: continue the run in the run folder, if there is one.
-
-    Returns:
-        The exit code: 0, or 130 after an interruption whose state is saved.
+    Returns the exit code: 0, or 130 after an interruption whose state is saved. With ``resume`` the
+    run in the run folder, if there is one, is continued.
 
     Raises:
         RequestError: the configuration does not fit the demonstrations, the machine or the run
@@ -99,7 +99,11 @@ def _train(
             if trainer.run(stop) < setup.total_steps:
                 return EXIT_INTERRUPTED
         if processes.is_main:
-            _draw_curves(config)
+            run = config.folder
+            if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
+                logger.info("curves: %s", run / CURVES)
+            else:
+                logger.info("no image of the curves: pip install matplotlib")
     return 0
 
 
@@ -135,35 +139,30 @@ class Trainer:
         images: ImageStore | None = None,
         log: MetricsLog | None = None,
     ) -> None:
-        config, given = setup.config, setup.demonstrations
-        settings = config.training
+        config, given, settings = setup.config, setup.demonstrations, setup.config.training
         self._setup, self._device, self._processes, self._log = setup, device, processes, log
         self._autocast = autocast_type(settings.precision, device, bool(given.spec.cameras))
         model = setup.make_model(initial_weights=start is None).to(device)
         self.state = TrainerState(model, settings)
         seconds = self.state.restore(start) if start else 0.0
         self._saved_step = start.step if start else 0
-        self._progress = StepProgress(
-            *(setup.total_steps, self._saved_step, seconds),
-            shown=processes.is_main,
-            log_every=config.log_every,
-        )
+        done = setup.total_steps, self._saved_step, seconds
+        self._progress = StepProgress(*done, shown=processes.is_main, log_every=config.log_every)
         self._timer = StepTimer(device)
         loss: nn.Module = _LossModule(model)
         if processes.world_size > 1:
             loss = DistributedDataParallel(loss, gradient_as_bucket_view=True)
         self._compute_loss = torch.compile(loss) if settings.compile else loss
+        names = task_entry(config.env).names
+        noise = StateNoise(given.spec, names, settings.state_noise, settings.clock_noise)
+        episodes = given.indices(setup.split.train)
         self.loader = BatchLoader(
-            *(given, setup.normalization, given.indices(setup.split.train), setup.sampler, model),
+            *(given, setup.normalization, episodes, setup.sampler, model),
             seed=config.seed,
             device=device,
             rank=processes.rank,
             world_size=processes.world_size,
-            state_noise=StateNoise(
-                *(given.spec, task_entry(config.env).names),
-                robot=settings.state_noise,
-                clock=settings.clock_noise,
-            ),
+            state_noise=noise,
             images=images,
         )
         self.held_out: HeldOutLoss | None = None
@@ -303,9 +302,44 @@ class _LossModule(nn.Module):
         return self.model.loss(batch)
 
 
-def _draw_curves(config: TrainConfig[Any]) -> None:
-    run = config.folder
-    if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
-        logger.info("curves: %s", run / CURVES)
-    else:
-        logger.info("no image of the curves: pip install matplotlib")
+class HeldOutLoss:
+    """Mean loss over fixed examples of the episodes held out, always with the same noise.
+
+    Of ``model`` the chunk size, observation steps and noise size are read; ``images`` are None
+    without cameras, ``autocast`` in fp32.
+    """
+
+    def __init__(
+        self,
+        setup: TrainSetup,
+        model: PolicyModel,
+        images: ImageStore | None,
+        device: torch.device,
+        autocast: torch.dtype | None,
+    ) -> None:
+        seed = derive_seed(setup.config.seed, "validation")
+        given, batch_size = setup.demonstrations, setup.config.training.batch_size
+        episodes = given.indices(setup.split.validation)
+        sampler = ExampleSampler(given.lengths[list(episodes)], "episode", batch_size, seed)
+        data = given, setup.normalization, episodes, sampler, model
+        self._loader = BatchLoader(*data, seed=seed, device=device, images=images)
+        self._steps = -(-HELD_OUT_STARTS * len(episodes) // batch_size)
+        self._device, self._autocast = device, autocast
+
+    @torch.no_grad()
+    def __call__(self, model: PolicyModel) -> dict[str, float]:
+        """Return the mean of each part of the loss, every valid step counting the same."""
+        was_training = model.training
+        model.eval()
+        names: list[str] = []
+        sums, weight = torch.zeros((), device=self._device), torch.zeros((), device=self._device)
+        autocast = torch.autocast(self._device.type, self._autocast, enabled=bool(self._autocast))
+        with autocast, contextlib.closing(self._loader.batches(0, self._steps)) as batches:
+            for batch in batches:
+                parts = model.loss(batch)
+                names = list(parts)
+                values = torch.stack([value.double() for value in parts.values()])
+                sums = sums + values * batch.num_valid
+                weight = weight + batch.num_valid
+        model.train(was_training)
+        return dict(zip(names, (sums / weight).tolist(), strict=True))

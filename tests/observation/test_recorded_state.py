@@ -12,8 +12,7 @@ from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import recorded_state
 from robo_manip_baselines.data.example import make_arrays, make_attributes
 from robo_manip_baselines.observation import ObservationSpec
-from robo_manip_baselines.rollout.demonstrate import Collection, collect
-from robo_manip_baselines.rollout.replay import remake_env
+from robo_manip_baselines.rollout.demonstrate import Collection, collect, remake_env
 
 from .conftest import NAMES, observe
 

@@ -161,7 +161,7 @@ def test_numbers_that_are_not_finite_are_refused() -> None:
 def test_bf16_is_close_and_other_precisions_are_refused() -> None:
     half = PolicyRunner(
         Network(), SPEC, normalization(), ENSEMBLE, num_envs=1, precision="bf16"
-    ).act(observe(1), np.array([0]))
+    ).act(*observe(1), np.array([0]))
     full = policy(1).act(*observe(1), np.array([0]))
     # bf16 has 8 bits: sums of 18 products of about 1, through tanh, scaled by up to 2.
     np.testing.assert_allclose(half, full, atol=0.1)

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import pytest
 import tyro
 
-from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.command import last_value, parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -200,3 +200,19 @@ def test_run_command_always_ends_the_process() -> None:
     with pytest.raises(SystemExit) as caught:
         run_command(lambda: None)
     assert caught.value.code == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "value"),
+    [
+        ("", None),
+        ("--out a", None),
+        ("--error_stats a", "a"),
+        ("--error-stats=a=b", "a=b"),
+        ("--error_stats a --error_stats b --out c", "b"),
+        ("--error_stats --out c", None),
+        ("--out c --error_stats", None),
+    ],
+)
+def test_the_last_value_of_an_option(line: str, value: str | None) -> None:
+    assert last_value(line.split(), "error_stats") == value

@@ -42,8 +42,8 @@ def make_checkpoint(env_config: EnvConfig) -> MakeCheckpoint:
 
     def make(folder: Path, **changes: object) -> Checkpoint:
         config = MlpConfig(chunk_size=6, hidden_size=16, hidden_layers=1)
-        sizes = PolicyDims(env_config.vector_size, env_config.action_size, 0, SPEC.image_size)
-        model = MlpModel(config, sizes)
+        dims = PolicyDims(env_config.vector_size, env_config.action_size, 0, SPEC.image_size)
+        model = MlpModel(config, dims)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             for parameter in model.parameters():
@@ -51,15 +51,15 @@ def make_checkpoint(env_config: EnvConfig) -> MakeCheckpoint:
         facts = {
             "policy": "Mlp",
             "config": config,
-            "sizes": sizes,
+            "dims": dims,
             "spec": SPEC,
             "env": "FeedingEnv",
-            "acting": ActionExecution(),
+            "execution": ActionExecution(),
             "normalization": Normalization(
-                np.zeros(sizes.state, np.float32),
-                np.ones(sizes.state, np.float32),
+                np.zeros(dims.state, np.float32),
+                np.ones(dims.state, np.float32),
                 middle,
-                np.full(sizes.action, 0.05, np.float32),
+                np.full(dims.action, 0.05, np.float32),
             ),
             "action_names": names,
             "control_period": 0.02,

@@ -17,17 +17,11 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.commands.rollout import parse_options, to_collection
-from robo_manip_baselines.data import (
-    EpisodeReader,
-    list_episodes,
-    read_metadata,
-    write_episode,
-)
+from robo_manip_baselines.data import EpisodeReader, list_episodes, read_metadata, write_episode
 from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
-from robo_manip_baselines.rollout.demonstrate import Collection, collect
-from robo_manip_baselines.rollout.replay import deviation
+from robo_manip_baselines.rollout.demonstrate import Collection, collect, deviation
 from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long

@@ -158,7 +158,7 @@ def children_of_group(group: int) -> list[int]:
         ("--checkpoint nowhere", "checkpoint 'nowhere' does not exist"),
         ("--temporal_ensemble --execute 2", "--temporal_ensemble and --n_action_steps: give one"),
         ("--n_action_steps 0", "n_action_steps 0"),
-        ("--execute 7", "execute 7: must be 1 to 6"),
+        ("--execute 7", "n_action_steps 7: must be 1 to 6"),
         ("--num_envs 0", "num_envs 0"),
         ("--workers -1", "workers -1"),
         ("--video -1", "video -1"),
@@ -243,7 +243,7 @@ def test_the_execution_is_the_trained_one_unless_changed() -> None:
     assert choose_execution(trained, False, None) == trained
     assert choose_execution(trained, False, 2) == replace(trained, n_action_steps=2)
     ensemble = choose_execution(trained, True, None)
-    assert (ensemble.temporal_ensemble, ensemble.decay) == (True, 0.1)
+    assert (ensemble.temporal_ensemble, ensemble.ensemble_decay) == (True, 0.1)
 
 
 def test_options_of_the_environment_come_from_the_demonstrations(

@@ -12,13 +12,7 @@ import pytest
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
-from robo_manip_baselines.rollout.videos import (
-    CYAN,
-    _dots,
-    pick_for_video,
-    video_name,
-    write_video,
-)
+from robo_manip_baselines.rollout.videos import CYAN, _dots, pick_for_video, video_name, write_video
 from robo_manip_baselines.rollout.workers import EnvConfig
 
 MISS = EpisodeResult(

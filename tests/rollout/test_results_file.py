@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from robo_manip_baselines.rollout.results import (
     RESULTS,
     EpisodeResult,
     ResultsFile,
+    open_results,
     read_results,
 )
 from robo_manip_baselines.runs.errors import RequestError
@@ -100,8 +102,8 @@ def test_rows_of_version_1_are_read() -> None:
     assert EpisodeResult.from_line(json.dumps(values)) == replace(MISS, observation=None)
 
 
-def open_file(folder: Path, **changes: Any) -> ResultsFile:
-    return ResultsFile(folder, {**SETTINGS, **changes}, {"condition": "current"})
+def open_file(folder: Path, **changes: Any) -> AbstractContextManager[ResultsFile]:
+    return open_results(folder, {**SETTINGS, **changes}, {"condition": "current"})
 
 
 def test_lines_are_there_at_once_and_by_seed_in_the_end(tmp_path: Path) -> None:
@@ -149,9 +151,10 @@ def test_results_of_other_settings_are_not_mixed(
     with open_file(tmp_path) as file:
         file.append(MISS)
     before = (tmp_path / RESULTS).read_bytes()
-    with pytest.raises(RequestError, match=message):
-        open_file(tmp_path, **changes)
-    open_file(tmp_path)
+    with pytest.raises(RequestError, match=message), open_file(tmp_path, **changes):
+        pass
+    with open_file(tmp_path):
+        pass
     assert (tmp_path / RESULTS).read_bytes() == before
 
 
@@ -165,22 +168,22 @@ def test_damage_is_named_with_its_line(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match=r"results.jsonl', line 2 is damaged"):
         read_results(tmp_path)
     path.write_text(whole + HIT.to_line() + "\n")
-    with pytest.raises(RequestError, match="two lines for seed 1002"):
-        open_file(tmp_path)
+    with pytest.raises(RequestError, match="two lines for seed 1002"), open_file(tmp_path):
+        pass
 
 
 def test_folders_that_are_not_ours_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="cannot be read"):
         read_results(tmp_path)
     (tmp_path / RESULTS).write_text("")
-    with pytest.raises(RequestError, match=r"without evaluation\.json"):
-        open_file(tmp_path)
+    with pytest.raises(RequestError, match=r"without evaluation\.json"), open_file(tmp_path):
+        pass
     (tmp_path / MANIFEST).write_text("{}")
-    with pytest.raises(RequestError, match="is damaged"):
-        open_file(tmp_path)
+    with pytest.raises(RequestError, match="is damaged"), open_file(tmp_path):
+        pass
     (tmp_path / MANIFEST).write_text('{"schema": "x", "version": 9, "settings": {}}')
-    with pytest.raises(RequestError, match="is of x version 9"):
-        open_file(tmp_path)
+    with pytest.raises(RequestError, match="is of x version 9"), open_file(tmp_path):
+        pass
     (tmp_path / "file").write_text("")
-    with pytest.raises(RequestError, match="cannot write"):
-        open_file(tmp_path / "file" / "below")
+    with pytest.raises(RequestError, match="cannot write"), open_file(tmp_path / "file" / "below"):
+        pass

@@ -81,9 +81,9 @@ def play(policy: ActingPolicy, envs: EnvPool, seeds: list[int]) -> Played:
     return results, recordings
 
 
-def network(checkpoint: Checkpoint, acting: ActionExecution, num_envs: int) -> PolicyRunner:
+def network(checkpoint: Checkpoint, execution: ActionExecution, num_envs: int) -> PolicyRunner:
     model, spec = load_model(checkpoint), checkpoint.spec
-    return PolicyRunner(model, spec, checkpoint.normalization, acting, num_envs=num_envs)
+    return PolicyRunner(model, spec, checkpoint.normalization, execution, num_envs=num_envs)
 
 
 POLICIES: dict[str, Callable[[Checkpoint, int], ActingPolicy]] = {
@@ -184,8 +184,8 @@ def test_only_what_the_policy_needs_is_rendered(env_config: EnvConfig) -> None:
         truth += [env.step(action)[0] for _ in range(3)]
     for workers in (0, 1):
         with open_envs(seen, 2, workers) as envs:
-            images, number = envs.arrays.images, 1
-            envs.arrays.actions[number] = action
+            images, number = envs.arrays["images"], 1
+            envs.arrays["actions"][number] = action
             requests = [
                 StepRequest(number, 5, True),
                 *[StepRequest(number, None, needed) for needed in (True, False, True)],
@@ -207,11 +207,12 @@ def test_only_what_the_policy_needs_is_rendered(env_config: EnvConfig) -> None:
 def test_a_worker_that_dies_is_an_error_and_not_a_hang(env_config: EnvConfig) -> None:
     class Murderer(Recurrent):
         def act(self, *arguments: Any) -> NDArray[np.float32]:
+            assert isinstance(envs, WorkerEnvs)
             os.kill(envs._workers[1].process.pid, signal.SIGKILL)
             return super().act(*arguments)
 
     with (
-        WorkerEnvs(env_config, 4, 2) as envs,
+        open_envs(env_config, 4, 2) as envs,
         pytest.raises(
             RuntimeError, match=r"worker process of environments 1, 3 died \(exit code -9\)"
         ),
@@ -231,10 +232,7 @@ def test_what_goes_wrong_in_a_worker_is_reported(env_config: EnvConfig) -> None:
     ):
         rollout(Lost(1), envs, [0])
     wrong = replace(env_config, env_kwargs={"clips": ("me",)})
-    with (
-        open_envs(wrong, 1, 1) as envs,
-        pytest.raises(RequestError, match="unknown clip 'me'"),
-    ):
+    with open_envs(wrong, 1, 1) as envs, pytest.raises(RequestError, match="unknown clip 'me'"):
         rollout(Recurrent(1), envs, [0])
     assert multiprocessing.active_children() == []
 
@@ -260,11 +258,13 @@ class Seeing(PolicyModel):
 
     chunk_size = 4
 
-    def predict(self, state: torch.Tensor, images: torch.Tensor | None) -> torch.Tensor:
+    def predict(
+        self, state: torch.Tensor, images: torch.Tensor | None, noise: torch.Tensor | None
+    ) -> torch.Tensor:
         assert images is not None
-        seen = images.float().flatten(1) / 255
+        seen = images[:, -1].float().flatten(1) / 255
         weight = torch.linspace(-1, 1, seen.shape[1])
-        glance = (seen * weight).mean(1) + 0.01 * state.sum(1)
+        glance = (seen * weight).mean(1) + 0.01 * state[:, -1].sum(1)
         return glance[:, None, None] * torch.linspace(-1, 1, 28).view(4, 7)
 
 
@@ -276,9 +276,9 @@ def test_a_network_that_sees_acts_the_same_in_any_arrangement(env_config: EnvCon
     ones, zeros = np.ones(seen.vector_size, np.float32), np.zeros(seen.vector_size, np.float32)
     scale = Normalization(zeros, ones, zeros[:7], ones[:7])
     played = []
-    for acting in (ActionExecution(), FIRST):
+    for execution in (ActionExecution(), FIRST):
         for num_envs, workers in ((1, 0), (3, 2)):
-            policy = PolicyRunner(Seeing(), spec, scale, acting, num_envs=num_envs)
+            policy = PolicyRunner(Seeing(), spec, scale, execution, num_envs=num_envs)
             with open_envs(seen, num_envs, workers) as envs:
                 _, recordings = play(policy, envs, SEEDS)
             played.append(np.array([recordings[seed].actions for seed in SEEDS]))

@@ -95,7 +95,7 @@ def test_a_policy_is_trained_and_evaluated(
 ) -> None:
     train = pytest.importorskip("robo_manip_baselines.commands.train")
     run, out = tmp_path / "run", tmp_path / "results"
-    options = "Mlp --env ChinTouchEnv --obs current --no_object_pose --steps 20 --device cpu"
+    options = "Mlp --env ChinTouchEnv --obs current --steps 20 --device cpu"
     options += " --logger none"
     assert train.main([*options.split(), f"--dataset={demonstrations}", f"--out={run}"]) == 0
     options = "ChinTouchEnv --policy Mlp --num_episodes 2 --num_envs 2 --workers 1"

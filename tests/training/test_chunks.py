@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.training.sampling import chunk_rows, window_rows
+from robo_manip_baselines.training.batching import chunk_rows, window_rows
 
 
 @given(st.data())

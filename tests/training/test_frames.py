@@ -127,10 +127,7 @@ def test_many_threads_may_ask(tmp_path: Path) -> None:
     loaded, images = load(tmp_path)
     rng = np.random.default_rng(0)
     asked = [rng.integers(0, sum(LENGTHS), 4) for _ in range(60)]
-    with (
-        ImageStore(loaded, memory_budget=0, threads=2) as source,
-        ThreadPoolExecutor(6) as pool,
-    ):
+    with ImageStore(loaded, memory_budget=0, threads=2) as source, ThreadPoolExecutor(6) as pool:
         for rows, got in zip(asked, pool.map(source.images, asked), strict=True):
             np.testing.assert_array_equal(got, images[rows])
 

@@ -21,9 +21,8 @@ from robo_manip_baselines.data.normalization import Normalization, mean_std
 from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.training.batching import BatchLoader, part_of
+from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise, part_of
 from robo_manip_baselines.training.images import ImageStore
-from robo_manip_baselines.training.sampling import ExampleSampler, StateNoise
 
 LENGTHS = (6, 9, 4, 7, 5)
 TRAIN = (3, 0, 4)  # not in order: the schedule's episodes are places in this list

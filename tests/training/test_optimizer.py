@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
 from robo_manip_baselines.policy.presets import PolicyDims, TrainSettings
-from robo_manip_baselines.training.optim import (
+from robo_manip_baselines.training.state import (
     WeightAverage,
     learning_rate_factor,
     make_optimizer,

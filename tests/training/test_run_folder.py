@@ -14,11 +14,7 @@ import yaml
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.registry import policy_names, policy_presets
-from robo_manip_baselines.runs.checkpoints import (
-    list_checkpoints,
-    prune_checkpoints,
-    step_folder,
-)
+from robo_manip_baselines.runs.checkpoints import list_checkpoints, prune_checkpoints, step_folder
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import locked
 from robo_manip_baselines.training.config import (

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from robo_manip_baselines.policy.presets import TrainSettings
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.training.sampling import ExampleSampler
+from robo_manip_baselines.training.batching import ExampleSampler
 
 LENGTHS = st.lists(st.integers(1, 9), min_size=1, max_size=8)
 

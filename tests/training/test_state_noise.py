@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from robo_manip_baselines.observation import ObservationSpec, ObservedNames
-from robo_manip_baselines.training.sampling import StateNoise, step_noise
+from robo_manip_baselines.training.batching import StateNoise, step_noise
 
 SPEC = ObservationSpec(obs="current_pred", horizon=3, cameras=(), object_pose=True)
 NAMES = ObservedNames(objects=("cube",))

@@ -94,7 +94,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
     process.communicate()
     (step, _), *_ = list_checkpoints(run)
     assert 0 < step < 200, "killed too late"
-    partial = run / "checkpoints" / ".step_00000199.1.partial"
+    partial = run / "checkpoints" / f".step_00000199.{process.pid}.partial"
     partial.mkdir()
     process = start(repository, f"Mlp --out {run} --resume")
     output, errors = process.communicate(timeout=TIMEOUT)
@@ -214,8 +214,7 @@ def test_missing_demonstrations_name_the_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("device", "message"),
-    [("tpu", "must be auto, cpu, cuda"), ("cuda:99", "device 'cuda:99'")],
+    ("device", "message"), [("tpu", "must be auto, cpu, cuda"), ("cuda:99", "device 'cuda:99'")]
 )
 def test_devices_that_are_not_there(device: str, message: str, line: str) -> None:
     with pytest.raises(RequestError, match=message):

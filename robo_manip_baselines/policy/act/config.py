@@ -83,14 +83,8 @@ class ActConfig:
 PRESETS = {
     "paper": PolicyPreset(
         config=ActConfig(),
-        training=TrainSettings(
-            batch_size=8,
-            learning_rate=1e-5,
-            sampler="episode",
-            epochs=2000,
-            validation_fraction=0.0,  # the paper trains on all 50
-        ),
-        execution=ActionExecution(temporal_ensemble=True, ensemble_decay=0.01),
+        training=TrainSettings(epochs=2000, validation_fraction=0.0),  # the paper trains on all 50
+        execution=ActionExecution(),
     ),
     "cpu": PolicyPreset(
         config=ActConfig(
@@ -105,7 +99,7 @@ PRESETS = {
             dropout=0.0,
         ),
         training=STATE_ONLY_TRAINING,
-        execution=ActionExecution(temporal_ensemble=True),
+        execution=ActionExecution(),
         cameras=(),
         object_pose=True,
     ),

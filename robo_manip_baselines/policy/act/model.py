@@ -27,12 +27,7 @@ TEMPERATURE = 10_000.0
 
 
 def sine_positions(length: int, size: int) -> Tensor:
-    """Return (L, D) sinusoidal position embeddings of the places 0 ... L - 1.
-
-    Args:
-        length: L.
-        size: D, even.
-    """
+    """Return (L, D) sinusoidal position embeddings of the places 0 ... L - 1; D is even."""
     return _waves(torch.arange(length, dtype=torch.float64), size).float()
 
 
@@ -40,21 +35,14 @@ def sine_positions_2d(height: int, width: int, size: int) -> Tensor:
     """Return (h * w, D) position embeddings of the cells of a feature map, row by row.
 
     The first half of D is the row, the second the column, both scaled to (0, 2 pi], as in DETR:
-    a cell keeps its position when the resolution changes.
-
-    Args:
-        height: h.
-        width: w.
-        size: D, a multiple of 4.
+    a cell keeps its position when the resolution changes. D is a multiple of 4.
     """
-    rows = _waves(torch.arange(1, height + 1, dtype=torch.float64) * (math.tau / height), size // 2)
-    columns = _waves(
-        torch.arange(1, width + 1, dtype=torch.float64) * (math.tau / width), size // 2
+    rows, columns = (
+        _waves(torch.arange(1, cells + 1, dtype=torch.float64) * (math.tau / cells), size // 2)
+        for cells in (height, width)
     )
-    grid = torch.cat(
-        [rows[:, None].expand(-1, width, -1), columns[None].expand(height, -1, -1)], dim=-1
-    )
-    return grid.flatten(0, 1).float()
+    parts = rows[:, None].expand(-1, width, -1), columns[None].expand(height, -1, -1)
+    return torch.cat(parts, dim=-1).flatten(0, 1).float()
 
 
 def _waves(places: Tensor, size: int) -> Tensor:
@@ -93,10 +81,6 @@ class Dropout(nn.Module):
         draws = words.view(torch.int16)[: x.numel()].view(x.shape)  # from -32,768 on
         kept = (draws >= dropped - _LEVELS // 2).to(x.dtype)
         return x * kept.mul_(_LEVELS / (_LEVELS - dropped))
-
-    def extra_repr(self) -> str:
-        """Return the settings that `print` shows."""
-        return f"{self.probability}"
 
 
 class Linear(nn.Linear):
@@ -143,17 +127,11 @@ class Attention(nn.Module):
             value_BMD: values: the same tokens without.
             keep_BM: bool, False for tokens to mask out; None for no mask.
         """
+        projected = self.query(query_BLD), self.key(key_BMD), self.value(value_BMD)
+        heads = [x_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for x_BLD in projected]
         mask = None if keep_BM is None else keep_BM[:, None, None, :]
-        attended_BGLE = nn.functional.scaled_dot_product_attention(
-            self._heads(self.query(query_BLD)),
-            self._heads(self.key(key_BMD)),
-            self._heads(self.value(value_BMD)),
-            attn_mask=mask,
-        )
+        attended_BGLE = nn.functional.scaled_dot_product_attention(*heads, attn_mask=mask)
         return self.out(attended_BGLE.transpose(1, 2).flatten(2))
-
-    def _heads(self, x_BLD: Tensor) -> Tensor:
-        return x_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
 
 class LayerNorm(nn.LayerNorm):
@@ -316,27 +294,18 @@ class CvaeEncoder(nn.Module):
         self.action_projection = ExactLinear(dims.action, width)
         self.encoder = Encoder(config, config.cvae_layers)
         self.latent_projection = ExactLinear(width, 2 * config.latent_size)
-        self.register_buffer(
-            "positions", sine_positions(2 + config.chunk_size, width), persistent=False
-        )
+        positions = sine_positions(2 + config.chunk_size, width)
+        self.register_buffer("positions", positions, persistent=False)
 
     def forward(self, state: Tensor, action: Tensor, is_pad: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and logarithm of the variance of the latent, each (B, Z) float32.
 
-        Args:
-            state: (B, S).
-            action: (B, K, A), finite also where ``is_pad``.
-            is_pad: (B, K) bool, actions to mask out.
+        ``state`` is (B, S); ``action`` (B, K, A) is finite also where ``is_pad`` (B, K).
         """
         batch = state.shape[0]
-        tokens = torch.cat(
-            [
-                self.class_token.expand(batch, 1, -1),
-                self.state_projection(state)[:, None],
-                self.action_projection(action),
-            ],
-            dim=1,
-        )
+        class_token = self.class_token.expand(batch, 1, -1)
+        parts = class_token, self.state_projection(state)[:, None], self.action_projection(action)
+        tokens = torch.cat(parts, dim=1)
         keep = torch.cat([is_pad.new_ones((batch, 2)), ~is_pad], dim=1)
         encoded = self.encoder(tokens, self.positions, keep)
         mean, log_variance = self.latent_projection(encoded[:, 0]).chunk(2, dim=-1)
@@ -373,9 +342,8 @@ class ActModel(PolicyModel):
         self.vision = Vision(config, dims) if dims.cameras else None
         self.encoder = Encoder(config, config.encoder_layers)
         self.queries = nn.Parameter(torch.randn(config.chunk_size, width))
-        self.decoder = Decoder(
-            config, config.decoder_layers, 1 if config.paper_compat else config.decoder_layers
-        )
+        num_run = 1 if config.paper_compat else config.decoder_layers
+        self.decoder = Decoder(config, config.decoder_layers, num_run)
         self.action_head = ExactLinear(width, dims.action)
         if config.backbone_weights is not None:
             load_backbone(self.vision and self.vision.backbone, config.backbone_weights)
@@ -426,22 +394,17 @@ class ActModel(PolicyModel):
         backbone = list(self.vision.backbone.parameters()) if self.vision is not None else []
         inside = {id(parameter) for parameter in backbone}
         trained = [p for p in self.parameters() if p.requires_grad and id(p) not in inside]
-        groups: list[dict[str, object]] = [{"params": trained, "lr": learning_rate}]
         slow = [p for p in backbone if p.requires_grad]
-        if slow:
-            factor = self.config.backbone_learning_rate_factor
-            groups.append({"params": slow, "lr": learning_rate * factor})
-        return groups
+        slow_rate = learning_rate * self.config.backbone_learning_rate_factor
+        groups: list[dict[str, object]] = [{"params": trained, "lr": learning_rate}]
+        return [*groups, {"params": slow, "lr": slow_rate}] if slow else groups
 
     def _actions(self, state: Tensor, images: Tensor | None, latent: Tensor | None) -> Tensor:
         """(B, K, A) float32 from (B, 1, S), (B, 1, N, H, W, 3) and (B, Z), None being 0."""
         state = state[:, -1]
         if latent is None:
             latent = state.new_zeros((state.shape[0], self.config.latent_size))
-        tokens = [
-            self.latent_projection(latent)[:, None],
-            self.state_projection(state)[:, None],
-        ]
+        tokens = [self.latent_projection(latent)[:, None], self.state_projection(state)[:, None]]
         positions: list[Tensor] = [self.token_positions]
         if self.vision is not None:
             image_tokens, image_positions = self.vision(images)
@@ -475,18 +438,11 @@ class Vision(nn.Module):
         if config.backbone_learning_rate_factor == 0.0:
             self.backbone.requires_grad_(False)
         self.projection = nn.Conv2d(self.backbone.features, config.hidden_size, 1)
-        self.cameras = (
-            None
-            if config.paper_compat
-            else nn.Parameter(torch.randn(dims.cameras, 1, config.hidden_size))
-        )
-        self.register_buffer(
-            "positions",
-            sine_positions_2d(*feature_size(dims.image), config.hidden_size).repeat(
-                dims.cameras, 1, 1
-            ),
-            persistent=False,
-        )
+        self.cameras: nn.Parameter | None = None
+        if not config.paper_compat:
+            self.cameras = nn.Parameter(torch.randn(dims.cameras, 1, config.hidden_size))
+        positions = sine_positions_2d(*feature_size(dims.image), config.hidden_size)
+        self.register_buffer("positions", positions.repeat(dims.cameras, 1, 1), persistent=False)
 
     def forward(self, images: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return tokens (B, N h w, D) fp32 and their positions (N h w, D).

@@ -22,8 +22,6 @@ STRIDE = 32
 WIDTHS = (64, 128, 256, 512)
 """Channels of the feature maps of the four stages; the last one's are its features."""
 
-BLOCKS_PER_STAGE = 2
-
 # Mean and standard deviation of ImageNet's colours from 0 to 1, with which torchvision's weights
 # were trained; public ACT uses them too.
 MEAN = (0.485, 0.456, 0.406)
@@ -117,17 +115,14 @@ class ResNet18(nn.Module):
         self.bn1 = FrozenBatchNorm(WIDTHS[0])
         channels_in = WIDTHS[0]
         for stage, channels_out in enumerate(WIDTHS, start=1):
-            blocks = [BasicBlock(channels_in, channels_out, 1 if stage == 1 else 2)]
-            blocks += [
-                BasicBlock(channels_out, channels_out, 1) for _ in range(BLOCKS_PER_STAGE - 1)
-            ]
-            self.add_module(f"layer{stage}", nn.Sequential(*blocks))
+            first = BasicBlock(channels_in, channels_out, 1 if stage == 1 else 2)
+            second = BasicBlock(channels_out, channels_out, 1)
+            self.add_module(f"layer{stage}", nn.Sequential(first, second))
             channels_in = channels_out
         self.features = channels_in
-        self.register_buffer("mean", 255.0 * torch.tensor(MEAN)[:, None, None], persistent=False)
-        self.register_buffer(
-            "scale", 1.0 / (255.0 * torch.tensor(STD))[:, None, None], persistent=False
-        )
+        mean, std = (255.0 * torch.tensor(values)[:, None, None] for values in (MEAN, STD))
+        self.register_buffer("mean", mean, persistent=False)
+        self.register_buffer("scale", 1.0 / std, persistent=False)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -178,11 +173,10 @@ def load_backbone(backbone: ResNet18 | None, path: str | Path) -> None:
     path = Path(path)
     if backbone is None:
         raise RequestError(f"backbone_weights '{path}' without cameras: leave one of the two out")
-    found = {
-        name: value
-        for name, value in _read(path).items()
-        if not name.startswith(_IGNORED_PREFIX) and not name.endswith(_IGNORED_SUFFIX)
-    }
+    found = _read(path)
+    for name in list(found):
+        if name.startswith(_IGNORED_PREFIX) or name.endswith(_IGNORED_SUFFIX):
+            del found[name]
     wanted = backbone.state_dict()
     for name in sorted(wanted.keys() | found.keys()):
         if name not in found:

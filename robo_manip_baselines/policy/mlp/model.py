@@ -35,8 +35,7 @@ class MlpModel(PolicyModel):
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the mean absolute error over valid steps as ``loss`` and ``l1``."""
-        error = nn.functional.l1_loss(
-            self.predict(batch.state, batch.images, None), batch.action, reduction="none"
-        )
+        actions = self.predict(batch.state, batch.images, None)
+        error = nn.functional.l1_loss(actions, batch.action, reduction="none")
         l1 = masked_mean(error, batch.is_pad, batch.num_valid)
         return {"loss": l1, "l1": l1}

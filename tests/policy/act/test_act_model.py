@@ -113,8 +113,7 @@ def test_every_valid_action_changes_the_loss(make_model, make_batch):
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [{}, {"paper_compat": True}, {"use_cvae": False}, {"pre_norm": True}],
+    "settings", [{}, {"paper_compat": True}, {"use_cvae": False}, {"pre_norm": True}]
 )
 @pytest.mark.parametrize("cameras", [0, 2])
 def test_what_is_trained_has_a_gradient_and_the_rest_has_none(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.policy.act.config import PRESETS
-from robo_manip_baselines.training.sampling import ExampleSampler
+from robo_manip_baselines.training.batching import ExampleSampler
 
 
 def test_paper_is_table_3() -> None:
