@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from robo_manip_baselines.data import EpisodeReader, decode_image, list_episodes
+from robo_manip_baselines.data import EpisodeReader, list_episodes
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.normalization import mean_std
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
@@ -25,6 +25,7 @@ from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import decode_image
 from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler
 from robo_manip_baselines.training.device import choose_device
 from robo_manip_baselines.training.images import ImageStore, fit_image, processors

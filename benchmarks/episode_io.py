@@ -16,11 +16,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from robo_manip_baselines.data import EpisodeReader, encode_image, write_episode
-from robo_manip_baselines.data.episode import CODECS
+from robo_manip_baselines.data import EpisodeReader, write_episode
 from robo_manip_baselines.data.example import make_arrays, make_attributes
 from robo_manip_baselines.data.verify import verify_file
 from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.images import CODECS, encode_image
 
 # So many that a picture takes as many bytes as one of FeedingEnv: 26 to 34 kB as JPEG at 90.
 NUM_SHAPES = 35

@@ -41,7 +41,6 @@ from face_prediction.prediction.errors import (
     mouth_errors,
     mouth_residuals,
     normalised_mean_errors,
-    skill,
 )
 from face_prediction.tracking.tracks import load_track
 
@@ -171,7 +170,10 @@ def print_kind(kind: str, windows: Windows, scores: dict[str, Scores], resamples
     for name, result in scores.items():
         errors = mouth_errors(result.residuals[rows])
         (u, v), (var_u, var_v) = errors.pooled_mean, errors.pooled_variance
-        gained = skill(mouth_distances(result.residuals[rows]), reference)
+        distances = mouth_distances(result.residuals[rows])
+        both = np.isfinite(distances) & np.isfinite(reference)
+        ours, theirs = (np.where(both, size, 0.0).sum(axis=0) for size in (distances, reference))
+        gained = 1 - ours / theirs
         skills = " | ".join(f"{gained[h]:+.2f}" for h in (0, len(gained) // 2, len(gained) - 1))
         print(
             f"| {name} | {u:.4f} | {var_u:.2e} | {v:.4f} | {var_v:.2e} | "

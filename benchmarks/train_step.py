@@ -26,6 +26,7 @@ import numpy as np
 
 from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import encode_image
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 prepare_pytorch()  # before PyTorch is imported: how its threads wait
@@ -33,7 +34,7 @@ prepare_pytorch()  # before PyTorch is imported: how its threads wait
 import torch  # noqa: E402
 
 from robo_manip_baselines.commands.train import parse_config  # noqa: E402
-from robo_manip_baselines.data import encode_image, episode_path, write_episode  # noqa: E402
+from robo_manip_baselines.data import episode_path, write_episode  # noqa: E402
 from robo_manip_baselines.data.example import make_arrays, make_attributes  # noqa: E402
 from robo_manip_baselines.policy.interface import Batch  # noqa: E402
 from robo_manip_baselines.runs.metrics import read_metrics  # noqa: E402

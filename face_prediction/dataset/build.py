@@ -14,7 +14,6 @@ import numpy as np
 
 from face_prediction.dataset.clip_file import (
     EncodedImages,
-    encode_image,
     open_clip,
     read_record,
     write_clip,
@@ -36,6 +35,7 @@ from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
+from robo_manip_baselines.runs.images import encode_image
 
 SAME_CLOCK = 1e-6
 """Two clocks of one video agree to this many seconds; they are read from the same file."""
@@ -210,7 +210,7 @@ def cut_images(
     for decoded, image in track_frames(path, track, label):
         for number in users.get(decoded, ()):
             cut = sequences.crops[number].cut(image, settings.crop_size)
-            encoded[number][decoded] = encode_image(cut, settings.quality)
+            encoded[number][decoded] = encode_image(cut, quality=settings.quality)
     index = np.zeros(wanted.shape, dtype=np.int64)
     ordered: list[np.ndarray] = []
     for number, row in enumerate(wanted):

@@ -19,12 +19,10 @@ import numpy as np
 from face_prediction.dataset.sequences import STATISTICS, ClipFrames, Sequences
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.images import REDUCTIONS
 
 SCHEMA = "face_dataset_clip"
 VERSION = 1
-
-REDUCTIONS = (1, 2, 4, 8)
-"""JPEG images can be decoded at 1 / these of their size without decoding the whole first."""
 
 READ_ERRORS = (KeyError, ValueError, OSError, RuntimeError, TypeError, OverflowError, MemoryError)
 """Errors that h5py and HDF5 raise on damaged bytes."""
@@ -45,38 +43,6 @@ FRAME_ARRAYS: tuple[tuple[str, tuple[int, ...], str, str, str], ...] = (
     ("image_lag", (), "float64", "s", "That frame's time less this one's"),
 )
 """Arrays of a clip, a row for each frame: name, shape after T, type, unit, description."""
-
-
-def encode_image(image: np.ndarray, quality: int) -> np.ndarray:
-    """JPEG bytes (N,) uint8 (4:2:0) of ``image`` (H, W, 3)."""
-    import cv2  # only images need it
-
-    sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling]
-    is_done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
-    if not is_done:
-        raise ValueError(f"OpenCV did not encode an image of shape {image.shape}")
-    return np.asarray(data, dtype=np.uint8).reshape(-1)
-
-
-def decode_image(data: np.ndarray, reduce: int = 1) -> np.ndarray:
-    """(H / reduce, W / reduce, 3) uint8 of JPEG bytes (N,) uint8.
-
-    Raises:
-        ValueError: the bytes are no image, or ``reduce`` is none of `REDUCTIONS`.
-    """
-    import cv2
-
-    if reduce not in REDUCTIONS:
-        raise ValueError(f"reduce {reduce}: one of {', '.join(map(str, REDUCTIONS))}")
-    flag = cv2.IMREAD_COLOR if reduce == 1 else getattr(cv2, f"IMREAD_REDUCED_COLOR_{reduce}")
-    try:
-        image = cv2.imdecode(data, flag) if data.size else None
-    except cv2.error as error:
-        raise ValueError(f"no image: {str(error).strip()}") from error
-    if image is None:
-        raise ValueError("no image")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image), dtype=np.uint8)
 
 
 def reduction(crop_size: int, size: int) -> int:

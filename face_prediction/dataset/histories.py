@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.dataset.build import track_frames
-from face_prediction.dataset.clip_file import decode_image, encode_image, reduction
+from face_prediction.dataset.clip_file import reduction
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.forecast.interface import Array, mouth_centre
 from face_prediction.motion.motion import Quality
 from face_prediction.prediction.interface import ImageNeeds
 from face_prediction.tracking.geometry import Crop, crop_around, image_points, image_rays
 from face_prediction.tracking.tracks import FaceTrack, Size
+from robo_manip_baselines.runs.images import decode_image, encode_image
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def dataset_image(
     """
     reduce = reduction(settings.crop_size, size)
     whole = crop.cut(image, settings.crop_size)
-    return decode_image(encode_image(whole, settings.quality), reduce)
+    return decode_image(encode_image(whole, quality=settings.quality), reduce)
 
 
 def history_images(

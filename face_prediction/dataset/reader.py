@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 
 from face_prediction.dataset.clip_file import (
-    REDUCTIONS,
     damage,
-    decode_image,
     open_clip,
     read_array,
     read_record,
@@ -34,6 +32,7 @@ from face_prediction.dataset.manifest import (
 from face_prediction.dataset.sequences import STATISTICS, SequenceSettings
 from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import REDUCTIONS, decode_image
 
 MAX_OPEN = 64
 """Clip files kept open at once; a process may open some thousand."""

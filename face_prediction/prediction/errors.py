@@ -110,24 +110,6 @@ def normalised_mean_errors(forecast: NDArray[np.floating], truth: NDArray[np.flo
     return distance.mean(axis=-1) / between_eyes
 
 
-def skill(errors: NDArray[np.floating], reference: NDArray[np.floating]) -> Floats:
-    """1 - mean error / mean error of the reference (H,), of errors (N, H) of the same sequences.
-
-    1 is a perfect forecast, 0 one no better than the reference (persistence, as a rule). Sequences
-    that either has no forecast of count for neither; a reference without error gives NaN.
-
-    Raises:
-        RequestError: the shapes differ.
-    """
-    if errors.shape != reference.shape:
-        raise RequestError(f"errors {errors.shape} against a reference of {reference.shape}")
-    both = np.isfinite(errors) & np.isfinite(reference)
-    ours, theirs = (
-        np.where(both, values, 0.0).sum(axis=0, dtype=np.float64) for values in (errors, reference)
-    )
-    return 1.0 - np.divide(ours, theirs, out=np.full_like(ours, np.nan), where=theirs > 0)
-
-
 def _require_same_shape(forecast: NDArray[np.floating], truth: NDArray[np.floating]) -> None:
     if forecast.shape != truth.shape or truth.ndim != 4 or truth.shape[-1] != 2:
         raise RequestError(

@@ -3,8 +3,6 @@
 from robo_manip_baselines.data.episode import (
     EpisodeFileError,
     EpisodeReader,
-    decode_image,
-    encode_image,
     read_metadata,
     write_episode,
 )
@@ -18,8 +16,6 @@ from robo_manip_baselines.data.files import (
 __all__ = [
     "EpisodeFileError",
     "EpisodeReader",
-    "decode_image",
-    "encode_image",
     "episode_path",
     "finished_seeds",
     "list_episodes",

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 
@@ -31,63 +30,7 @@ from robo_manip_baselines.data.schema import (
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, entry_of_id
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import atomic_file
-
-CODECS = ("jpeg", "png", "raw")
-
-# At 90 the error of a rendered scene is below what a policy's image augmentation adds;
-# benchmarks/episode_io.py prints size and error for each codec.
-DEFAULT_QUALITY = 90
-
-
-def encode_image(
-    image: np.ndarray, codec: str = "jpeg", quality: int = DEFAULT_QUALITY
-) -> np.ndarray:
-    """Encode one image.
-
-    Args:
-        image: (H, W, 3) uint8, RGB.
-        codec: ``jpeg`` (4:2:0), ``png`` (lossless) or ``raw``.
-        quality: of JPEG, 1…100.
-
-    Returns:
-        (N,) uint8, a whole JPEG or PNG file; for ``raw`` a copy of the image itself.
-
-    Raises:
-        RequestError: for an unknown codec.
-        ValueError: if ``image`` is not (H, W, 3) uint8.
-    """
-    require_choice("image codec", codec, CODECS)
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
-        raise ValueError(f"an image is (H, W, 3) uint8, not {image.shape} {image.dtype}")
-    if codec == "raw":
-        return np.array(image, order="C")
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    if codec == "png":
-        is_done, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 3])
-    else:
-        sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
-        options = [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling]
-        is_done, data = cv2.imencode(".jpg", bgr, options)
-    if not is_done:
-        raise ValueError(f"OpenCV did not encode an image of shape {image.shape} as {codec}")
-    return np.asarray(data, dtype=np.uint8).reshape(-1)
-
-
-def decode_image(data: np.ndarray) -> np.ndarray:
-    """Return the (H, W, 3) uint8 RGB image of which `encode_image` made ``data``, by any codec.
-
-    Raises:
-        ValueError: the bytes are no image.
-    """
-    if data.ndim == 3:
-        return data
-    try:
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    except cv2.error as error:
-        raise ValueError(f"no image: {str(error).strip()}") from error
-    if bgr is None:
-        raise ValueError("no image")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+from robo_manip_baselines.runs.images import CODECS, decode_image
 
 
 def image_checksum(data: np.ndarray) -> int:
@@ -330,7 +273,7 @@ def write_episode(
         path: file to write, see `files.episode_path`. Replaced if it is there.
         arrays: every field of the task's schema, optional ones where they are known; float32 is
             widened.
-        images: camera -> T frames, each from `images.encode_image` with the codec that
+        images: camera -> T frames, each from `encode_image` with the codec that
             ``attributes["image_codec"]`` names. Empty without cameras.
         attributes: every attribute of the schema that is not derived.
 

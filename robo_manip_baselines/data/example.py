@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from robo_manip_baselines.data.episode import encode_image
 from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.runs.images import encode_image
 
 
 def make_arrays(

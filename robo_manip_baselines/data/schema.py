@@ -199,33 +199,6 @@ def shape_text(field: Field) -> str:
     return f"({', '.join(map(str, field.shape))}{',' if len(field.shape) == 1 else ''})"
 
 
-def field_table(schema: EpisodeSchema) -> str:
-    """The fields as a Markdown table, as printed in ``docs/episode_format.md``."""
-    lines = ["| name | shape | type | unit | frame | what it is |", "|---|---|---|---|---|---|"]
-    lines += [
-        f"| `{f.name}` | {shape_text(f)} | {f.dtype} | {f.unit or '–'} | {f.frame or '–'} "
-        f"| {f.description} |"
-        for f in schema.fields
-    ]
-    return "\n".join(lines)
-
-
-def attribute_table(schema: EpisodeSchema) -> str:
-    """The attributes as a Markdown table, as printed in ``docs/episode_format.md``."""
-    lines = ["| name | kind | what it is |", "|---|---|---|"]
-    for item in schema.attributes:
-        kind = f"{item.length} numbers" if item.kind == "vector" else item.kind
-        lines.append(f"| `{item.name}` | {kind} | {item.description} |")
-    return "\n".join(lines)
-
-
-def symbol_table() -> str:
-    """The shape symbols as a Markdown table, as printed in ``docs/episode_format.md``."""
-    lines = ["| symbol | size |", "|---|---|"]
-    lines += [f"| {symbol} | {text} |" for symbol, text in SYMBOLS.items()]
-    return "\n".join(lines)
-
-
 def stored_attribute(item: Attribute, value: Any) -> Any:
     """Turn a value into what HDF5 keeps: UTF-8, int64, float64, bool or a float64 vector.
 

@@ -18,7 +18,6 @@ from robo_manip_baselines.data.episode import (
     READ_ERRORS,
     EpisodeFileError,
     FrameStore,
-    decode_image,
     one_line,
     open_hdf5,
     require_schema,
@@ -36,6 +35,7 @@ from robo_manip_baselines.data.schema import (
     value_problems,
 )
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import decode_image
 
 SHARED_ATTRIBUTES = (*POLICY_ATTRIBUTES, "env_kwargs", "cameras", "image_size")
 """Attributes that the episodes of a folder must share."""

@@ -119,20 +119,6 @@ class Corruption:
             require_choice("setting of the corruption", name, names)
         return cls(**values)
 
-    def override(self, changes: Mapping[str, Any]) -> Corruption:
-        """Return the same with other settings; what no longer fits the error is dropped.
-
-        Raises:
-            RequestError: a value is not valid.
-        """
-        start = self
-        if changes.get("error", self.error) not in MEASURED_ERRORS:
-            start = replace(self, error="none", error_stats=None, stats_sha256=None)
-            changes = {"error": self.error, **changes}
-        elif "error_stats" in changes:
-            start = replace(self, stats_sha256=None)
-        return replace(start, **changes)
-
     def __bool__(self) -> bool:
         """Return whether anything is corrupted."""
         return self.error != "none" or bool(self.delay or self.face_dropout or self.detector_rate)

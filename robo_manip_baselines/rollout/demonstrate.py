@@ -23,20 +23,19 @@ from tqdm import tqdm
 
 from robo_manip_baselines.data import (
     EpisodeReader,
-    encode_image,
     episode_path,
     finished_seeds,
     read_metadata,
     remove_partial_episodes,
     write_episode,
 )
-from robo_manip_baselines.data.episode import CODECS, DEFAULT_QUALITY
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id, make_env, task_entry
 from robo_manip_baselines.policy.presets import require_at_least
 from robo_manip_baselines.rollout.results import completion_time, require_seeds
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, write_json
+from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_image
 from robo_manip_baselines.runs.versions import software_versions
 
 SUMMARY = "summary.json"

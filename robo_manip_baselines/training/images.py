@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
-from robo_manip_baselines.data.episode import EpisodeFileError, EpisodeReader, decode_image
+from robo_manip_baselines.data.episode import EpisodeFileError, EpisodeReader
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import decode_image
 
 Images = NDArray[np.uint8]
 

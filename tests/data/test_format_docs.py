@@ -13,16 +13,42 @@ from robo_manip_baselines.data.example import make_arrays, make_attributes, make
 from robo_manip_baselines.data.schema import (
     SCHEMA,
     SCHEMA_VERSION,
+    SYMBOLS,
     EpisodeSchema,
-    attribute_table,
-    field_table,
-    symbol_table,
+    shape_text,
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 
 FEEDING = EpisodeSchema.of(task_entry("FeedingEnv"))
 PAGE = (Path(__file__).parents[2] / "docs" / "episode_format.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+
+
+def field_table(schema: EpisodeSchema) -> str:
+    """The fields as a Markdown table, as printed in ``docs/episode_format.md``."""
+    lines = ["| name | shape | type | unit | frame | what it is |", "|---|---|---|---|---|---|"]
+    lines += [
+        f"| `{f.name}` | {shape_text(f)} | {f.dtype} | {f.unit or '–'} | {f.frame or '–'} "
+        f"| {f.description} |"
+        for f in schema.fields
+    ]
+    return "\n".join(lines)
+
+
+def attribute_table(schema: EpisodeSchema) -> str:
+    """The attributes as a Markdown table, as printed in ``docs/episode_format.md``."""
+    lines = ["| name | kind | what it is |", "|---|---|---|"]
+    for item in schema.attributes:
+        kind = f"{item.length} numbers" if item.kind == "vector" else item.kind
+        lines.append(f"| `{item.name}` | {kind} | {item.description} |")
+    return "\n".join(lines)
+
+
+def symbol_table() -> str:
+    """The shape symbols as a Markdown table, as printed in ``docs/episode_format.md``."""
+    lines = ["| symbol | size |", "|---|---|"]
+    lines += [f"| {symbol} | {text} |" for symbol, text in SYMBOLS.items()]
+    return "\n".join(lines)
 
 
 @pytest.mark.parametrize("table", [field_table(FEEDING), attribute_table(FEEDING), symbol_table()])

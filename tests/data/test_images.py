@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robo_manip_baselines.data import decode_image, encode_image
 from robo_manip_baselines.data.example import make_frames
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import decode_image, encode_image
 
 
 @pytest.mark.parametrize("codec", ["png", "raw"])

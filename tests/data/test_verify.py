@@ -14,13 +14,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from robo_manip_baselines.data import EpisodeReader, encode_image, episode_path, write_episode
+from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
 from robo_manip_baselines.data.episode import image_checksum
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_frames, make_images
 from robo_manip_baselines.data.schema import EpisodeSchema, content_digest, loaded_attribute
 from robo_manip_baselines.data.verify import damage_summary, verify_dataset, verify_file
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import encode_image
 
 SCHEMA = EpisodeSchema.of(task_entry("FeedingEnv"))
 

@@ -14,7 +14,6 @@ from face_prediction.prediction.errors import (
     mouth_errors,
     mouth_residuals,
     normalised_mean_errors,
-    skill,
 )
 from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
@@ -99,18 +98,6 @@ def test_pooled_is_per_frame_put_together(residuals: np.ndarray) -> None:
 def test_wrong_residuals_are_refused(residuals: np.ndarray, told: str) -> None:
     with pytest.raises(RequestError, match=told):
         mouth_errors(residuals)
-
-
-def test_skill_against_a_reference() -> None:
-    reference = np.array([[2.0, 1.0, 0.0], [4.0, 3.0, 0.0]])
-    gained = skill(np.array([[0.0, 2.0, 1.0], [3.0, 2.0, 1.0]]), reference)
-    np.testing.assert_allclose(gained[:2], [0.5, 0.0])
-    assert np.isnan(gained[2])
-    np.testing.assert_array_equal(skill(reference, reference)[:2], 0.0)
-    # a sequence that one of them has no forecast of counts for neither
-    np.testing.assert_allclose(skill(np.array([[1.0], [np.nan]]), np.array([[4.0], [9.0]])), 0.75)
-    with pytest.raises(RequestError, match="reference"):
-        skill(reference[:1], reference)
 
 
 def test_distance_is_that_of_pythagoras() -> None:

@@ -126,16 +126,3 @@ def test_statistics_are_pinned_to_their_file(stats_file: Path) -> None:
         assert same.pinned() == same
     with pytest.raises(RequestError, match="not those that were used before"):
         Corruption("gaussian", stats_sha256=own.stats_sha256).pinned()
-
-
-def test_overrides_keep_what_still_fits() -> None:
-    trained = Corruption("uniform", "a.json", "ab" * 32, delay=2, seed=5)
-    assert trained.override({}) == trained
-    assert trained.override({"delay": 0}) == Corruption("uniform", "a.json", "ab" * 32, seed=5)
-    assert trained.override({"error": "none"}) == Corruption(delay=2, seed=5)
-    assert not trained.override({"error": "none", "delay": 0})
-    kept = trained.override({"error": "gaussian"})
-    assert kept == Corruption("gaussian", "a.json", "ab" * 32, delay=2, seed=5)
-    other = trained.override({"error_stats": "b.json"})
-    assert other == Corruption("uniform", "b.json", None, delay=2, seed=5)
-    assert trained.override({"error": "model"}) == Corruption("model", delay=2, seed=5)

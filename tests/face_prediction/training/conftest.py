@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from face_prediction.commands.train import run_train
-from face_prediction.dataset.clip_file import EncodedImages, encode_image, write_clip
+from face_prediction.dataset.clip_file import EncodedImages, write_clip
 from face_prediction.dataset.manifest import (
     ClipEntry,
     Manifest,
@@ -27,6 +27,7 @@ from face_prediction.tracking.geometry import LIPS
 from face_prediction.training import trainer as trainer_module
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import WindowBatch
+from robo_manip_baselines.runs.images import encode_image
 
 SEQUENCES = SequenceSettings(history=8, future=2, stride=4, crop_size=64)
 PEOPLE = {"ann": 0, "bob": 0, "cat": 1, "dan": 2, "eve": 2}
@@ -49,7 +50,7 @@ def face_pictures(landmarks: np.ndarray) -> list[np.ndarray]:
     for u, v in landmarks[:, list(LIPS), :2].mean(axis=1):
         picture = np.full((64, 64, 3), 90, dtype=np.uint8)
         cv2.circle(picture, (round(u * 1024), round(v * 1024)), 64, (250, 30, 30), -1, shift=4)
-        pictures.append(encode_image(picture, 95))
+        pictures.append(encode_image(picture, quality=95))
     return pictures
 
 
