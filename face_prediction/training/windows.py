@@ -54,7 +54,7 @@ class SequenceImages:
         self._reduce = crop // size
         if crop != size * self._reduce or self._reduce not in (1, 2, 4, 8):
             raise RequestError(
-                f"{dataset.folder}: pictures of {crop} pixels, but this network needs {size} "
+                f"{dataset.folder}: images of {crop} pixels, but this network needs {size} "
                 f"(or 2, 4 or 8 times that); make the dataset with --crop_size {size}"
             )
         self._dataset, self._size = dataset, size

@@ -1,1 +1,1 @@
-"""The benchmark: every arm trained and evaluated on common seeds, see ``docs/benchmark.md``."""
+"""The benchmark: every condition trained and evaluated on common seeds (``docs/benchmark.md``)."""

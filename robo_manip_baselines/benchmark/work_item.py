@@ -132,7 +132,7 @@ class ArtifactStore:
         return read_manifest(self.folder(item), item.key)
 
     def is_done(self, item: WorkItem) -> bool:
-        """Whether all outputs of an item are there."""
+        """Return whether all outputs of an item exist."""
         return self.manifest(item) is not None
 
     def outputs(self, item: WorkItem) -> dict[str, Path]:

@@ -260,7 +260,7 @@ def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> 
 
 
 _worker: dict[str, Any] = {}
-"""What a worker process keeps between its episodes; empty in every other process."""
+"""State of a worker process between episodes; empty in every other process."""
 
 
 def _start_worker(collection: Collection) -> None:

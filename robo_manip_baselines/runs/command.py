@@ -109,7 +109,7 @@ def parse(
 ) -> Options:
     """Read the command line into ``options_type``.
 
-    ``--help`` prints every option with its default, and the example. Options are spelt with
+    ``--help`` prints every option with its default, and the example. Options are written with
     underscores; hyphens work too.
 
     Args:
@@ -204,7 +204,7 @@ def _unknown_message(unknown: Sequence[str], help_page: str, prog: str) -> str:
 
 
 def _box_to_line(text: str) -> str:
-    """What tyro says in its box, without the box, the help text and the footer."""
+    """Return the text of tyro's box, without the box, the help text and the footer."""
     lines = _ANSI.sub("", text).splitlines()
     body: list[str] = []
     for line in lines[1:]:
