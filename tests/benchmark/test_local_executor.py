@@ -153,7 +153,7 @@ def test_other_software_is_refused(
     store = ArtifactStore(tmp_path)
     item = stub_plan.items()[0]
     request = {**item.to_json(), **other}
-    monkeypatch.setitem(item.__dict__, "document", lambda: request)
+    monkeypatch.setitem(item.__dict__, "to_json", lambda: request)
     executor = LocalExecutor(store, 1)
     executor.start(item)
     (ended,) = wait(executor)
