@@ -43,9 +43,9 @@ class Options:
     precision: str = "bf16"
     """bf16 (autocast) or fp32, of our network; the other one is fp32."""
     compile: bool = False
-    """Whether our network goes through torch.compile."""
+    """Use torch.compile for our network."""
     cuda_graph: bool = False
-    """Whether our step and our prediction are recorded once and replayed; CUDA only."""
+    """Replay our step and our prediction from CUDA graphs; CUDA only."""
     batch_size: int = 8
     """Examples in a training step."""
     steps: int = 5
@@ -66,7 +66,7 @@ class Options:
     """Count the seconds that processors work, not those that pass: for a machine that others use
     too. With --threads 1; CPU only."""
     public: bool = True
-    """Whether to time the public code's way too."""
+    """Time the public code's way, too."""
 
     def __post_init__(self) -> None:
         require_choice("device", self.device, ("auto", "cpu", "cuda"))
@@ -79,7 +79,7 @@ class Options:
 
     @property
     def clock(self) -> Callable[[], float]:
-        """What tells the time, in seconds."""
+        """Clock, in seconds."""
         return time.process_time if self.processor_time else time.perf_counter
 
     @property

@@ -1,4 +1,4 @@
-"""How fast training batches come: vectors alone, images held in memory, images decoded ahead.
+"""Throughput of training batches: vectors alone, images held in memory, images decoded ahead.
 
 Records a few episodes of three 480 x 640 cameras, unless --dataset names some.
 Prints Markdown tables. Run: ``python benchmarks/batch_loading.py``.
@@ -50,7 +50,7 @@ class Options:
     image_size: str = "480x640"
     """Height x width to train at; smaller than recorded images are shrunk."""
     step_ms: float = 20.0
-    """How long a training step would take, in ms, for the wait between steps."""
+    """Assumed duration of a training step, in ms: the wait between steps."""
     threads: int = 0
     """Threads that decode; 0 for one for each processor."""
     device: str = "auto"

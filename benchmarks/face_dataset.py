@@ -104,7 +104,7 @@ def held_out_error(inputs: np.ndarray, wanted: np.ndarray, fold: np.ndarray) -> 
 
 
 def crop_table(dataset: FaceDataset, tracks: Path) -> str:
-    """What crops around the history and around the whole sequence give away, as Markdown."""
+    """Markdown table of the information leaked by crops around history and whole sequence."""
     lines = [
         "| crop around | axes | off the middle | ... then moves to the other side "
         "| error from last steps | ... and place | both where off the middle |",

@@ -1,4 +1,4 @@
-"""How well MediaPipe's face detector finds the drawn face in ``front_close``, and pictures of it.
+"""Detection rate of MediaPipe's face detector on the drawn face in ``front_close``, with images.
 
 Recorded poses from every run of the shipped motion library, at base offsets of ±5 cm an axis, are
 rendered at 640×480 with the arms at their start; the mouth's centre (mean of the 40 lip landmarks)

@@ -133,7 +133,7 @@ def score(name: str, windows: Windows, fold: np.ndarray, history: int) -> Scores
 
 
 def describe(arrays: dict[str, np.ndarray]) -> str:
-    """What a fit chose, shortly: order x components, or the filter's ratio of variances."""
+    """Hyperparameters of a fit: order x components, or the filter's ratio of variances."""
     if "coefficients" in arrays:
         return " x ".join(str(n) for n in arrays["coefficients"].shape[:2])
     if "process" in arrays:

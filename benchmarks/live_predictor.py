@@ -63,7 +63,7 @@ class Taken:
 
 
 def frame_times(run: Callable[[int], object], first: int, count: int) -> Taken:
-    """What ``run(number)`` takes, for ``count`` numbers from ``first`` on."""
+    """Durations of ``run(number)``, for ``count`` numbers from ``first`` on."""
     taken = np.empty((2, count))
     for place in range(count):
         begun, worked = time.perf_counter(), time.process_time()

@@ -1,4 +1,4 @@
-"""What adapting to the face that is watched is worth: the prior of residual prediction, in parts.
+"""Gain from adapting to the watched face: the prior of residual prediction, in parts.
 
 Every fold of a dataset is forecast by what was fitted to the others, from landmarks alone::
 

@@ -1,4 +1,4 @@
-"""How fast the VX300s' servos follow: a 0.3 rad step of every arm joint, a grasp and a held cube.
+"""Step response of the VX300s' servos: a 0.3 rad step of every arm joint, a grasp and a held cube.
 
 Prints a table and draws the responses (``--plot``):
 

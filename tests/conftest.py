@@ -1,4 +1,4 @@
-"""What every test shares: the rendering backend, the development clips, hypothesis' profiles."""
+"""Fixtures of all tests: the rendering backend, the development clips, hypothesis' profiles."""
 
 from __future__ import annotations
 

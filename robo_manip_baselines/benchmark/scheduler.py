@@ -51,7 +51,7 @@ class Executor(Protocol):
     """Place where work items run."""
 
     def has_room(self, item: WorkItem) -> bool:
-        """Whether an item can be started now."""
+        """Return True if an item can be started now."""
         ...
 
     def workers(self, threads: int, gpus: float) -> int:
@@ -84,7 +84,7 @@ class LocalExecutor:
         self._running: list[tuple[WorkItem, subprocess.Popen[bytes]]] = []
 
     def has_room(self, item: WorkItem) -> bool:
-        """Whether a worker is free."""
+        """Return True if a worker is free."""
         return len(self._running) < self._workers
 
     def workers(self, threads: int, gpus: float) -> int:

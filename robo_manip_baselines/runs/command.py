@@ -231,7 +231,7 @@ def _say(line: str, code: int) -> int:
 
 
 def _is_reader_gone() -> bool:
-    """Whether stdout is a pipe that nobody reads any more."""
+    """Return True if stdout is a pipe without a reader."""
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), select.POLLOUT)

@@ -180,7 +180,7 @@ class Processes:
 
     @property
     def is_main(self) -> bool:
-        """Whether this process writes files and logs."""
+        """True for the process that writes files and logs."""
         return self.rank == 0
 
     @contextmanager

@@ -145,7 +145,7 @@ def contents(out: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def reference_folder(stub_plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What one worker leaves."""
+    """Output folder of a run with one worker."""
     out = tmp_path_factory.mktemp("reference")
     do(stub_plan, out, 1)
     return out
@@ -153,5 +153,5 @@ def reference_folder(stub_plan: Plan, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="module")
 def reference(reference_folder: Path) -> dict[str, bytes]:
-    """What one worker comes to."""
+    """Contents of `reference_folder`."""
     return contents(reference_folder)

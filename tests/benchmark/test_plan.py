@@ -1,4 +1,4 @@
-"""Which items there are, what tells them apart, and what they share."""
+"""Work items of a plan: names, keys, and shared demonstrations."""
 
 from __future__ import annotations
 

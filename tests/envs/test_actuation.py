@@ -1,4 +1,4 @@
-"""How the arms move, and how they grip and hold."""
+"""Motion of the arms, grasping and holding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every registered environment promises (after dm_control's suite tests)."""
+"""Contract of every registered environment (after dm_control's suite tests)."""
 
 from __future__ import annotations
 

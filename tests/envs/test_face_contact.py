@@ -1,4 +1,4 @@
-"""What of the face can be touched, by whom, and what holds a cube that was let go."""
+"""Contacts of the face, and support of a released cube."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the face looks like, to colour oracles and to MediaPipe's detector."""
+"""Appearance of the face, to colour oracles and to MediaPipe's detector."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ def test_native_noise_is_shown_only_when_something_fails(capfd) -> None:
 
 
 class TestModelFile:
-    """Where the model comes from."""
+    """Source of the model."""
 
     @pytest.fixture(autouse=True)
     def cache(self, tmp_path: Path, monkeypatch) -> Path:

@@ -1,4 +1,4 @@
-"""What every registered forecaster promises."""
+"""Contract of every registered forecaster."""
 
 from __future__ import annotations
 

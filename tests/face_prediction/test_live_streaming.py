@@ -84,7 +84,7 @@ def pictures(frames: int) -> list[np.ndarray]:
 
 
 def batch(model, landmarks, images, now: int, crop: Crop) -> np.ndarray:
-    """What the network says of the whole history at once, in a crop."""
+    """Forecast of the network from the whole history at once, in a crop."""
     from face_prediction.models.interface import History
 
     rows = np.maximum(np.arange(now - SETTINGS.history + 1, now + 1), 0)

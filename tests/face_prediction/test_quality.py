@@ -1,4 +1,4 @@
-"""What counts as a jump, a spike, a lost face, a head turned away: tables at the limits."""
+"""Thresholds of jumps, spikes, lost faces and turned heads: tables at the limits."""
 
 from __future__ import annotations
 

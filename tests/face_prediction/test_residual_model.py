@@ -96,7 +96,7 @@ def test_pictures_count_once_it_is_trained(model: ResidualModel) -> None:
 
 
 def test_forward_is_decode_of_frame_by_frame_features(model: ResidualModel) -> None:
-    """What live keeps of past frames is what a whole history gives."""
+    """State kept by the live predictor equals that of a whole history."""
     model = trained(model)
     seen = history()
     marks = seen.landmarks[:, -3:]

@@ -108,7 +108,7 @@ def test_training_sees_what_evaluation_sees(
 
 
 def test_the_world_is_the_same_with_and_without(library: Path) -> None:
-    """What is shown differs, what happens does not: no draw is taken from the world's generator."""
+    """Observations differ, dynamics do not: no draw is taken from the world's generator."""
     tracks = []
     for corruption in (None, {"error": "uniform", "face_dropout": 0.2}):
         kwargs = {"obs": "current_pred", "cameras": (), "corruption": corruption}

@@ -107,7 +107,7 @@ def test_a_spec_goes_through_json(values: dict[str, Any]) -> None:
 
 
 def test_a_spec_without_corruption_is_stored_as_ever() -> None:
-    """What was written before there was a corruption, bit for bit; hashes are made of it."""
+    """JSON of a spec without corruption, as in early versions; hashes are made of it."""
     stored = (
         '{"obs": "current", "horizon": 2, "cameras": [], "image_size": [480, 640], '
         '"object_pose": true, "error": "none", "arms": "right"}'

@@ -1,4 +1,4 @@
-"""What a policy is shown, against slow and obvious oracles."""
+"""Observations of a policy, against slow and obvious oracles."""
 
 from __future__ import annotations
 

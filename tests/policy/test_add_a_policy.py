@@ -29,7 +29,7 @@ SHORT = {
     "--logger none --device cpu --validation_fraction 0.3 --validate_every 10",
     "--policy": "--num_episodes 1 --workers 0 --device cpu",
 }
-"""What is added to the page's commands so that they take seconds."""
+"""Options added to the page's commands so that they take seconds."""
 
 
 @pytest.fixture(scope="module")

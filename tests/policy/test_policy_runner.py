@@ -143,7 +143,7 @@ def test_only_environments_that_need_a_prediction_are_computed() -> None:
 
 
 def test_rows_of_a_tile_that_are_not_used_do_not_matter() -> None:
-    """What an earlier tile left in the memory is wiped, so that even its NaNs do no harm."""
+    """Memory left by an earlier tile is wiped, so that even its NaNs do no harm."""
     runner = policy(4, tile=4)
     runner._state_tile.fill_(torch.nan)
     runner.act(*observe(1), np.array([0]))

@@ -1,4 +1,4 @@
-"""What the project's tests look at: the files that are, or are about to be, in git."""
+"""Input of the project's tests: the files that are, or are about to be, in git."""
 
 from __future__ import annotations
 

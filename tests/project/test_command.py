@@ -24,15 +24,15 @@ class Options:
     env: Annotated[str, tyro.conf.arg(metavar="ENV"), tyro.conf.Positional]
     """Name of the environment."""
     num_episodes: int = 50
-    """How many."""
+    """Number of episodes."""
     ratio: float = 0.5
-    """How much."""
+    """Proportion."""
     image_codec: Literal["jpeg", "png", "raw"] = "jpeg"
-    """How images are kept."""
+    """Codec of images."""
     out: Path = Path("dataset")
-    """Where to."""
+    """Output folder."""
     scripted: bool = False
-    """Who acts."""
+    """Use the scripted expert."""
 
     def __post_init__(self) -> None:
         if self.num_episodes < 0:

@@ -36,7 +36,7 @@ FACE = (
 )
 FLOORS = {"robo_manip_baselines": ROBOT, "face_prediction": FACE}
 BENEATH = "robo_manip_baselines.runs"
-"""What face_prediction may import of the other package."""
+"""Module that face_prediction may import of the other package."""
 
 
 def imported(source: str) -> set[str]:

@@ -1,4 +1,4 @@
-"""What may be in the repository, and the shape its code keeps."""
+"""Rules for files in the repository and for the form of code."""
 
 from __future__ import annotations
 

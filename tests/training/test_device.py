@@ -124,7 +124,7 @@ def test_processes_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) ->
 def test_nothing_that_trained_is_left_when_the_processes_part(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What holds on to the group keeps its threads, and the interpreter aborts at its end."""
+    """References to the group keep its threads, and the interpreter aborts at its end."""
 
     class Network:
         def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Which examples a step sees: every one in its turn, at random, and the same ones every time."""
+"""Examples of a training step: every one in its turn, at random, and the same ones every time."""
 
 from __future__ import annotations
 

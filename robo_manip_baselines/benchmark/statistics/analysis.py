@@ -144,7 +144,7 @@ class BenchmarkStatistics:
 
     @property
     def has_many_train_seeds(self) -> bool:
-        """Whether any condition was trained more than once."""
+        """True if any condition was trained more than once."""
         return any(len(c.outcomes.train_seeds) > 1 for c in self.conditions)
 
 

@@ -68,7 +68,7 @@ def dataset(make_track, write_video, tmp_path_factory) -> Path:
 
 
 def red_dots(images: np.ndarray) -> np.ndarray:
-    """Where (..., 2) the dot is in images (..., S, S, 3)."""
+    """Position (..., 2) of the dot in images (..., S, S, 3)."""
     red = np.clip(images[..., 0].astype(float) - images[..., 1] - 60, 0, None)
     grid = (np.arange(red.shape[-1]) + 0.5) / red.shape[-1]
     total = red.sum(axis=(-1, -2))

@@ -111,7 +111,7 @@ def options(dataset: Path, tmp_path: Path) -> FaceTrainOptions:
 
 @pytest.fixture(scope="session")
 def whole(dataset: Path, tmp_path_factory) -> Path:
-    """What the options leave when nothing comes between."""
+    """Run folder of the options, trained without interruption."""
     options = twelve_steps(dataset, tmp_path_factory.mktemp("runs") / "whole")
     assert run_train(options) == 0
     return options.folder

@@ -62,7 +62,7 @@ def test_another_network_is_refused(tmp_path: Path, state: dict[str, Tensor], ch
 
 
 class Surprise:
-    """What a hostile file does when it is unpickled."""
+    """Payload of a hostile file, run when it is unpickled."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return (exec, ("import pathlib; pathlib.Path('surprise').touch()",))

@@ -1,4 +1,4 @@
-"""What bf16 may change, and that the copy for inference predicts the same."""
+"""Error bounds of bf16; equality of the model and its copy for inference."""
 
 from __future__ import annotations
 
