@@ -89,7 +89,13 @@ def test_help_shows_defaults_and_the_example(capsys: pytest.CaptureFixture[str])
         parse(Options, EXAMPLE, args=["--help"])
     assert not caught.value.code
     page = capsys.readouterr().out
-    for part in ("Try out a command line.", EXAMPLE, "--num_episodes", "default: 50", "How many."):
+    for part in (
+        "Try out a command line.",
+        EXAMPLE,
+        "--num_episodes",
+        "default: 50",
+        "Number of episodes.",
+    ):
         assert part in page
 
 
