@@ -85,7 +85,7 @@ class TrainSettings:
             to read the next target off the last one, and fails where no demonstration has been.
         clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
             for all its frames. A policy that can read the clock releases by the clock, whether or
-            not it has reached the mouth.
+            not it has reached the target.
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
@@ -170,7 +170,7 @@ class PolicyPreset:
         config: the policy's own frozen dataclass.
         training: optimiser, sampling and budget.
         execution: execution of the predicted action chunks.
-        cameras, image_size, object_pose: observed beside the robot and the mouth.
+        cameras, image_size, object_pose: observed beside the robot and the target.
     """
 
     config: Any

@@ -153,7 +153,7 @@ def step_noise(seed: int, stream: str, step: int, count: int, size: int) -> Tens
 class StateNoise:
     """Gaussian noise on normalised states: on proprioception and on the clock.
 
-    Mouth and cube are left as they are. ``robot`` is ``TrainSettings.state_noise``, ``clock``
+    Target and objects are left as they are. ``robot`` is ``TrainSettings.state_noise``, ``clock``
     ``TrainSettings.clock_noise``.
     """
 
