@@ -191,7 +191,7 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
     axes.set(xlabel=HORIZON_LABEL, ylabel="success, %", xlim=(-1.4, last + 0.4), ylim=(0.0, 100.0))
     axes.grid(axis="y")
     if axes.get_legend_handles_labels()[1]:
-        axes.legend(loc="lower right", ncols=2, fontsize=9)
+        figure.legend(loc="outside lower center", ncols=4, fontsize=9)
     seeds = (
         " over training and evaluation seeds" if statistics.has_many_train_seeds else " (Wilson)"
     )
