@@ -223,8 +223,6 @@ class Plan:
         }
         config = TrainConfig.from_json({**known, **settings})
         spec = condition.observation(config.spec)
-        if not task_entry(self.env).names.objects:
-            spec = replace(spec, object_pose=False)
         files = self._files()
         if self.error_stats and spec.corruption.error in MEASURED_ERRORS:
             spec = replace(spec, corruption=replace(spec.corruption, error_stats=STATS))
