@@ -168,7 +168,7 @@ def read_json_array(arrays: Arrays, key: str, name: str | Path) -> dict[str, Any
         RequestError: it is no JSON object; ``name`` is that of the file.
     """
     try:
-        value = parse_json(str(arrays[key]))
+        value = parse_json(str(arrays[key]), f"{name}: '{key}'")
     except ValueError:
         value = None
     if not isinstance(value, dict):
@@ -176,16 +176,16 @@ def read_json_array(arrays: Arrays, key: str, name: str | Path) -> dict[str, Any
     return value
 
 
-def parse_json(text: str) -> Any:
-    """Parse JSON text.
+def parse_json(text: str, source: str) -> Any:
+    """Parse JSON text; ``source`` is for messages.
 
     Raises:
         ValueError: it is no JSON, or nested too deeply.
     """
     try:
         return json.loads(text)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{source} is no JSON: {error}") from None
 
 
 def arrays_digest(arrays: Mapping[str, np.ndarray]) -> str:
@@ -319,7 +319,9 @@ def _read(archive: zipfile.ZipFile, member: _Member) -> np.ndarray:
         raise ValueError(f"'{name}' holds values that are neither true nor false")
     if not place:
         return np.zeros(member.shape, member.dtype)
-    array = data.view(member.dtype).reshape(member.shape, order="F" if member.fortran_order else "C")
+    array = data.view(member.dtype).reshape(
+        member.shape, order="F" if member.fortran_order else "C"
+    )
     if array.dtype.byteorder == ">":
         array = array.astype(array.dtype.newbyteorder("="))
     if array.dtype.kind == "U":

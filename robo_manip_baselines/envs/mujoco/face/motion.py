@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -293,11 +293,6 @@ def _run_problem(content: Arrays) -> str:
     return ""
 
 
-@cache
-def _shipped_sha256() -> str:
-    return MotionLibrary.load().sha256
-
-
 def pin_library(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments of an environment with the digest of the motion library that they name.
 
@@ -310,18 +305,3 @@ def pin_library(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
         library.require(pinned.get("motion_sha256"))
         pinned["motion_sha256"] = library.sha256
     return pinned
-
-
-def without_library_path(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return arguments of an environment that name the motion library by its content alone.
-
-    A path tells nothing where files may be replaced or moved. Without a path, the library is the
-    one that ships with the package. The path stays where older releases recorded no digest.
-    """
-    kwargs = dict(env_kwargs)
-    if kwargs.get("motion_library") and not kwargs.get("motion_sha256"):
-        return kwargs
-    kwargs.pop("motion_library", None)
-    if kwargs.get("motion_sha256") in (None, _shipped_sha256()):
-        kwargs.pop("motion_sha256", None)
-    return kwargs
