@@ -108,7 +108,7 @@ def test_runs_know_no_faces_and_no_robots(repository: Path) -> None:
 
 
 OPENERS = {
-    r"\bnp\.(load|lib\.format)\b|\bimport zipfile": "runs/npz.py",
+    r"np\.load\b|np\.lib\.format|\bNpzFile\b|_MAGIC = b.*NUMPY": "runs/npz.py",
     r"safetensors\.torch\.load|safe_open|import load_file": "runs/tensors.py",
     r"h5py\.File\(.*\"r\"": "runs/hdf5.py",
 }
