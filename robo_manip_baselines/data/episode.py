@@ -212,7 +212,7 @@ class FrameStore:
         checksum = dataset_of(file, f"{group}/checksum")
         is_joined = self._data.ndim == 1
         offset = dataset_of(file, f"{group}/offset") if is_joined else None
-        frames = len(self._data) if offset is None else offset.size - 1
+        frames = len(self._data) if offset is None else len(offset) - 1
         if frames != num_steps or checksum.shape != (num_steps,):
             raise ValueError(f"{frames} frames instead of {num_steps}")
         if self._data.dtype != np.uint8 or checksum.dtype != np.uint32:
@@ -225,10 +225,10 @@ class FrameStore:
             return
         if offset.dtype != np.int64 or offset.ndim != 1:
             raise ValueError(f"offsets of type {offset.dtype}")
-        self._offset = read_whole(offset)
-        if self._offset[0] or self._offset[-1] != len(self._data):
+        place = self._offset = read_whole(offset)
+        sizes = np.diff(place)
+        if place[0] or place[-1] != len(self._data):
             raise ValueError("its offsets do not divide its bytes")
-        sizes = np.diff(self._offset)
         if sizes.min() < 0 or sizes.max() > 4 * int(np.prod(size)) * 3 + _CHUNK_BYTES:
             raise ValueError(f"a frame of {sizes.min()} or {sizes.max()} bytes")
 

@@ -333,7 +333,10 @@ def attribute_problems(task: TaskEntry | None, attributes: Mapping[str, Any]) ->
             lambda x: isinstance(x, dict) and all(isinstance(v, str) for v in x.values()),
             "must be an object of texts",
         ),
-        "xml_hash": (lambda x: re.fullmatch("[0-9a-f]{64}", x), "must be 64 hexadecimal digits"),
+        "xml_hash": (
+            lambda x: bool(re.fullmatch("[0-9a-f]{64}", x)),
+            "must be 64 hexadecimal digits",
+        ),
         "env_kwargs": (lambda x: not env_kwargs_problem(task, x), ""),
     }
     problems = []

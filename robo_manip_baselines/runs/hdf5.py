@@ -69,13 +69,12 @@ def require_own_links(group: h5py.Group) -> None:
     Raises:
         ValueError: one is a soft or external link, or there are too many.
     """
-    from h5py import h5l
-
+    low = _low_level()
     if len(group) > MAX_LINKS:
         raise ValueError(f"{len(group)} members in '{group.name}'; at most {MAX_LINKS} are read")
     links = group.id.links
     for name in group.id:
-        if links.get_info(name).type != h5l.TYPE_HARD:
+        if links.get_info(name).type != low.h5l.TYPE_HARD:
             shown = name.decode(errors="replace")
             raise ValueError(f"'{shown}' is a link to another place or file")
 
@@ -88,16 +87,16 @@ def dataset_of(file: h5py.Group, name: str) -> h5py.Dataset:
         ValueError: it is of another kind, or lies elsewhere.
     """
     import h5py
-    from h5py import h5d, h5g, h5l, h5o
 
+    low = _low_level()
     item: Any = file.id
     for part in name.encode().split(b"/"):
-        if not isinstance(item, h5g.GroupID) or not item.links.exists(part):
+        if not isinstance(item, low.h5g.GroupID) or not item.links.exists(part):
             raise KeyError(f"no dataset '{name}'")
-        if item.links.get_info(part).type != h5l.TYPE_HARD:
+        if item.links.get_info(part).type != low.h5l.TYPE_HARD:
             raise ValueError(f"'{name}' is a link to another place or file")
-        item = h5o.open(item, part)
-    if not isinstance(item, h5d.DatasetID):
+        item = low.h5o.open(item, part)
+    if not isinstance(item, low.h5d.DatasetID):
         raise KeyError(f"no dataset '{name}'")
     if problem := _storage_problem(item):
         raise ValueError(f"'{name}' {problem}")
@@ -106,11 +105,10 @@ def dataset_of(file: h5py.Group, name: str) -> h5py.Dataset:
 
 def read_whole(dataset: h5py.Dataset) -> np.ndarray:
     """Return all numbers of an array from `dataset_of`. Raises one of `READ_ERRORS`."""
-    from h5py import h5s
-
+    low = _low_level()
     values = np.empty(dataset.shape, dataset.dtype)
     if values.size:
-        dataset.id.read(h5s.ALL, h5s.ALL, values)
+        dataset.id.read(low.h5s.ALL, low.h5s.ALL, values)
     return values
 
 
@@ -121,14 +119,13 @@ def attribute_of(file: h5py.Group | h5py.Dataset, name: str) -> Any:
         KeyError: there is none of that name.
         ValueError: it is too large, or neither numbers nor one text.
     """
-    from h5py import h5a, h5t
-
-    if not h5a.exists(file.id, name.encode()):
+    low = _low_level()
+    if not low.h5a.exists(file.id, name.encode()):
         raise KeyError(f"attribute '{name}' is missing")
-    item = h5a.open(file.id, name.encode())
+    item = low.h5a.open(file.id, name.encode())
     kind = item.get_type()
-    is_text = kind.get_class() == h5t.STRING and item.shape == ()
-    if not is_text and kind.get_class() not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM):
+    is_text = kind.get_class() == low.h5t.STRING and item.shape == ()
+    if not is_text and kind.get_class() not in (low.h5t.INTEGER, low.h5t.FLOAT, low.h5t.ENUM):
         raise ValueError(f"attribute '{name}' is neither a number nor text")
     if item.shape is None or item.get_storage_size() > MAX_ATTRIBUTE:
         raise ValueError(f"attribute '{name}' has {item.get_storage_size()} bytes")
@@ -147,27 +144,33 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(message).split()) or type(error).__name__
 
 
-def _storage_problem(dataset: h5py.h5d.DatasetID) -> str:
-    """Return why the data of an array cannot be trusted to lie in the file, or nothing."""
-    from h5py import h5d, h5t, h5z
+def _low_level() -> Any:
+    """Return h5py for the use of its low-level modules, which pyright does not know."""
+    import h5py
 
-    if dataset.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM):
+    return h5py
+
+
+def _storage_problem(dataset: Any) -> str:
+    """Return why the data of an array cannot be trusted to lie in the file, or nothing."""
+    low = _low_level()
+    if dataset.get_type().get_class() not in (low.h5t.INTEGER, low.h5t.FLOAT, low.h5t.ENUM):
         return "holds no plain numbers"
     shape, dtype = dataset.shape, dataset.dtype
     if shape is None or dtype.kind not in "biuf":
         return "holds no plain numbers"
     layout = dataset.get_create_plist()
     kind = layout.get_layout()
-    if kind == h5d.VIRTUAL or layout.get_external_count():
+    if kind == low.h5d.VIRTUAL or layout.get_external_count():
         return "has its data in another file"
     filters = {layout.get_filter(index)[0] for index in range(layout.get_nfilters())}
-    if not filters <= {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}:
+    if not filters <= {low.h5z.FILTER_DEFLATE, low.h5z.FILTER_SHUFFLE, low.h5z.FILTER_FLETCHER32}:
         return "is compressed by a filter other than gzip"
     size = math.prod(shape) * dtype.itemsize
-    chunk = math.prod(layout.get_chunk()) * dtype.itemsize if kind == h5d.CHUNKED else 0
+    chunk = math.prod(layout.get_chunk()) * dtype.itemsize if kind == low.h5d.CHUNKED else 0
     if chunk > max(size, _MAX_CHUNK):
         return f"has chunks of {chunk} bytes"
     stored = int(dataset.get_storage_size())
-    if size > stored * (MAX_INFLATION if h5z.FILTER_DEFLATE in filters else 1):
+    if size > stored * (MAX_INFLATION if low.h5z.FILTER_DEFLATE in filters else 1):
         return f"declares {size} bytes, of which the file cannot hold all"
     return ""

@@ -105,7 +105,7 @@ def encoded_size(data: NDArray[Any]) -> tuple[int, int]:
     if data.ndim == 3:
         height, width, channels = data.shape
     else:
-        content = memoryview(np.ascontiguousarray(data).reshape(-1))
+        content = np.ascontiguousarray(data).reshape(-1).data
         if content[:2] == b"\xff\xd8":
             height, width, channels = _jpeg_size(content)
         elif content[:8] == _PNG_START:
