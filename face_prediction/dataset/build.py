@@ -143,6 +143,7 @@ def clip_entry(out: Path, row: Attribution, kind: str) -> ClipEntry:
     with open_clip(path) as file:
         record: dict[str, Any] = read_record(path, file)
     kept = ("track_sha256", "video", "video_sha256", "sequences", "candidates", "dropped")
+    record.setdefault("content_sha256", "")  # files of older releases
     return ClipEntry(
         clip=row.clip,
         subject=row.subject,
@@ -151,7 +152,7 @@ def clip_entry(out: Path, row: Attribution, kind: str) -> ClipEntry:
         ship=row.ship,
         licence=row.licence,
         source=row.source,
-        **{name: record[name] for name in kept},
+        **{name: record[name] for name in (*kept, "content_sha256")},
     )
 
 

@@ -45,6 +45,7 @@ class ClipEntry:
         sequences: sequences kept.
         candidates: sequences tried.
         dropped: how many were dropped for each reason.
+        content_sha256: of the content of the clip's file; empty in datasets of older releases.
     """
 
     clip: str
@@ -60,6 +61,7 @@ class ClipEntry:
     sequences: int
     candidates: int
     dropped: dict[str, int]
+    content_sha256: str = ""
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from face_prediction.dataset.clip_file import (
+    clip_array,
     damage,
     open_clip,
-    read_array,
     read_record,
+    read_rows,
 )
 from face_prediction.dataset.manifest import (
     CLIP_FOLDER,
@@ -32,7 +34,7 @@ from face_prediction.dataset.manifest import (
 from face_prediction.dataset.sequences import STATISTICS, SequenceSettings
 from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.images import REDUCTIONS, decode_image
+from robo_manip_baselines.runs.images import REDUCTIONS, decode_image, encoded_size
 
 MAX_OPEN = 64
 """Clip files kept open at once; a process may open some thousand."""
@@ -81,6 +83,7 @@ class FaceDataset:
         counts = [clip.sequences for clip in self.manifest.clips]
         self._ends = np.cumsum(counts, dtype=np.int64)
         self._files: OrderedDict[int, _ClipReader] = OrderedDict()
+        self._verified: set[int] = set()
         self._process = os.getpid()
 
     def __len__(self) -> int:
@@ -183,7 +186,9 @@ class FaceDataset:
             return self._files[place]
         clip = self.manifest.clips[place]
         path = self.folder / CLIP_FOLDER / f"{clip.clip}.h5"
-        reader = self._files[place] = _ClipReader(path, clip, self.manifest.settings)
+        verify = place not in self._verified  # once is enough: files may be reopened often
+        reader = self._files[place] = _ClipReader(path, clip, self.manifest.settings, verify)
+        self._verified.add(place)
         if len(self._files) > MAX_OPEN:
             _, oldest = self._files.popitem(last=False)
             oldest.file.close()
@@ -197,9 +202,12 @@ class _ClipReader:
         RequestError: it was made from something else, or with other settings.
     """
 
-    def __init__(self, path: Path, clip: ClipEntry, settings: SequenceSettings) -> None:
+    def __init__(
+        self, path: Path, clip: ClipEntry, settings: SequenceSettings, verify: bool
+    ) -> None:
         self.path = path
-        self.file = open_clip(path)
+        self.file = open_clip(path, verify=verify)
+        self._arrays: dict[str, h5py.Dataset] = {}
         try:
             record = read_record(path, self.file)
             self.start = self.array("sequences/start")
@@ -214,21 +222,49 @@ class _ClipReader:
                 "settings": settings.to_json(),
             }
             wrong = [key for key, value in wanted.items() if record.get(key) != value]
+            if not wrong and clip.content_sha256 not in ("", record.get("content_sha256")):
+                wrong.append("frames")
             shape = (clip.sequences, settings.length)
             if len(self.start) != clip.sequences or self._index.shape != shape:
                 wrong.append("sequences")
+            elif not self._is_consistent(settings):
+                raise RequestError(f"{path}: its sequences lie outside its frames or images")
             if wrong:
                 problem = f"its {', '.join(wrong)} are not those of the dataset"
                 raise RequestError(f"{path}: {problem}; make the dataset again")
         except RequestError:
             self.file.close()
             raise
-        self._length = settings.length
+        self._length, self._side = settings.length, settings.crop_size
         width, height = record["image_size"]
         self._image_size = (int(width), int(height))
 
+    def _is_consistent(self, settings: SequenceSettings) -> bool:
+        """Whether starts, crops and images of the sequences point into the arrays."""
+        frames = len(clip_array(self.path, self.file, "frames/valid"))
+        stored = len(clip_array(self.path, self.file, "pictures/data"))
+        images, sizes = len(self._checksum), np.diff(self._offset)
+        if len(self._offset) != images + 1 or self._offset[0] or self._offset[-1] != stored:
+            return False
+        if images and not (
+            sizes.min() >= 0 and sizes.max() <= 4 * settings.crop_size**2 * 3 + 2**16
+        ):
+            return False
+        if not len(self.start):
+            return True
+        return bool(
+            len(self._crops) == len(self.start)
+            and self.start.min() >= 0
+            and self.start.max() <= frames - settings.length
+            and self._index.min() >= 0
+            and self._index.max() < images
+            and self._crops[:, 2].min() > 0
+        )
+
     def array(self, name: str, rows: Any = ()) -> np.ndarray:
-        return read_array(self.path, self.file, name, rows)
+        if name not in self._arrays:
+            self._arrays[name] = clip_array(self.path, self.file, name)
+        return read_rows(self.path, self._arrays[name], name, rows)
 
     def rows(self, number: int) -> slice:
         start = int(self.start[number])
@@ -254,6 +290,8 @@ class _ClipReader:
             try:
                 if zlib.crc32(encoded.tobytes()) != int(self._checksum[image]):
                     raise ValueError("its checksum is wrong")
+                if encoded_size(encoded) != (self._side, self._side):
+                    raise ValueError(f"it is {encoded_size(encoded)}, not of side {self._side}")
                 images.append(decode_image(encoded, reduce))
             except ValueError as error:
                 raise RequestError(f"{self.path}: image {image}: {damage(error)}") from None

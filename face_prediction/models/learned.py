@@ -25,11 +25,13 @@ from face_prediction.models.interface import History, Output, PredictorModel
 from face_prediction.models.settings import make_predictor_model, settings_class
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs import tensors as tensor_files
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file, read_json, write_json
+from robo_manip_baselines.runs.npz import parse_json
+from robo_manip_baselines.runs.tensors import require_alike, require_finite
 
 try:
-    import safetensors
     import safetensors.torch
 except ModuleNotFoundError:
     raise RequestError(
@@ -239,15 +241,8 @@ def load_tensors(model: PredictorModel, tensors: Mapping[str, Tensor], source: P
     Raises:
         RequestError: they do not fit; the first that differs is named.
     """
-    wanted = model.state_dict()
-    for name in sorted({*wanted, *tensors}):
-        if name not in tensors:
-            raise RequestError(f"{source}: tensor '{name}' is missing")
-        if name not in wanted:
-            raise RequestError(f"{source}: tensor '{name}' is none of this network")
-        found, expected = (f"{x.dtype} {tuple(x.shape)}" for x in (tensors[name], wanted[name]))
-        if found != expected:
-            raise RequestError(f"{source}: tensor '{name}' is {found}, expected {expected}")
+    require_alike(tensors, model.state_dict(), source)
+    require_finite(tensors, source)
     model.load_state_dict(tensors)
 
 
@@ -273,13 +268,11 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
         RequestError: the file is absent, damaged or of another kind.
     """
     _require_file(path)
+    tensors, metadata = tensor_files.read_tensors(path)
     try:
-        with safetensors.safe_open(path, framework="pt", device="cpu") as file:
-            # cloned: tensors must not change when the file is replaced
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-            record = json.loads(file.metadata()["record"])
+        record = parse_json(metadata["record"], f"{path}: its record")
         digest = record.pop("sha256")
-    except (OSError, LookupError, TypeError, ValueError, safetensors.SafetensorError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise RequestError(
             f"{path}: damaged, or not written by this program ({type(error).__name__}: {error})"
         ) from None

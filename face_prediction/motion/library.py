@@ -28,7 +28,7 @@ from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES, continuous_q
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import require_out_file
-from robo_manip_baselines.runs.npz import read_npz, require_array, require_json, write_npz
+from robo_manip_baselines.runs.npz import ArrayType, FileType, read_json_array, read_npz, write_npz
 
 SCHEMA = "recorded_face_motion"
 VERSION = 1
@@ -50,19 +50,26 @@ MOUTH_MODEL = (
     "canonical mouth centre, normal to the head's z axis"
 )
 
-_ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
-    "fps": ("f", ()),
-    "time": ("f", ("N",)),
-    "mouth": ("f", ("N", 3)),
-    "orientation": ("f", ("N", 4)),
-    "jaw": ("f", ("N",)),
-    "run_start": ("iu", ("R",)),
-    "run_length": ("iu", ("R",)),
-    "run_clip": ("U", ("R",)),
-    "run_subject": ("U", ("R",)),
-    "predicted_mouth": ("f", ("N", "H", 3)),
-}
-"""Kind and shape of every array of the file; the last one may be absent."""
+LIBRARY_FILE = FileType(
+    SCHEMA,
+    VERSION,
+    {
+        "fps": ArrayType("f", (), "positive"),
+        "time": ArrayType("f", ("N",)),
+        "mouth": ArrayType("f", ("N", 3)),
+        "orientation": ArrayType("f", ("N", 4), "quaternion"),  # float32 ones are unit to 1e-7
+        "jaw": ArrayType("f", ("N",), "not negative"),
+        "run_start": ArrayType("iu", ("R",), "not negative"),
+        "run_length": ArrayType("iu", ("R",), "positive"),
+        "run_clip": ArrayType("U", ("R",)),
+        "run_subject": ArrayType("U", ("R",)),
+        "metadata": ArrayType("U"),
+        "predicted_mouth": ArrayType("f", ("N", "H", 3), is_optional=True),
+    },
+    # A day at 30 frames a second, in runs of a second; ten seconds ahead.
+    limits={"N": 2_592_000, "R": 86_400, "H": 300},
+)
+"""Arrays of a library file; robo_manip_baselines reads the same file for its environments."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +203,7 @@ def attributed_tracks(tracks: Iterable[Path], table: Path | None) -> list[tuple[
 
 def refuse_other_files(out: Path) -> None:
     """Raise RequestError if ``out`` is a folder, or a file of another kind."""
-    require_out_file(out, lambda path: read_npz(path, SCHEMA, VERSION))
+    require_out_file(out, lambda path: read_npz(path, LIBRARY_FILE))
 
 
 @dataclass(frozen=True)
@@ -376,7 +383,7 @@ def join_runs(
 def save_motion(path: Path, motion: RecordedMotion) -> None:
     """Write ``motion`` to ``path``, whole or not at all."""
     arrays = {"schema": np.array(SCHEMA), "version": np.array(VERSION)}
-    for name in (*list(_ARRAYS)[:-1], "metadata", "predicted_mouth"):
+    for name in LIBRARY_FILE.arrays:
         value = getattr(motion, name)
         if name == "metadata":
             value = json.dumps(value, sort_keys=True)
@@ -392,26 +399,16 @@ def load_motion(path: Path) -> RecordedMotion:
         RequestError: the file is absent, damaged, of another schema, or its arrays do not agree;
             the message names the file and the key.
     """
-    arrays = read_npz(path, SCHEMA, VERSION)
-    lengths = {
-        "N": len(require_array(path, arrays, "time", (None,), "f")),
-        "R": len(require_array(path, arrays, "run_start", (None,), "iu")),
-        "H": None,
-    }
-    values: dict[str, Any] = {}
-    for name, (kind, shape) in _ARRAYS.items():
-        if name in arrays or name != "predicted_mouth":
-            sizes = tuple(lengths[n] if isinstance(n, str) else n for n in shape)
-            values[name] = require_array(path, arrays, name, sizes, kind)
-            if kind == "f" and not np.all(np.isfinite(values[name])):
-                raise RequestError(f"{path}: '{name}' holds NaN or infinity")
+    values: dict[str, Any] = read_npz(path, LIBRARY_FILE)
+    values["metadata"] = read_json_array(values, "metadata", path)
+    values |= {name: values[name].astype(np.int64) for name in ("run_start", "run_length")}
     values["fps"] = float(values["fps"])
-    motion = RecordedMotion(**values, metadata=require_json(path, arrays, "metadata"))
+    motion = RecordedMotion(**values)
     joined = np.concatenate([[0], motion.run_start + motion.run_length])
     is_whole = np.array_equal(joined, [*motion.run_start, len(motion.time)])
-    if len(joined) == 1 or motion.fps <= 0 or np.any(motion.run_length < 2) or not is_whole:
+    if len(joined) == 1 or np.any(motion.run_length < 2) or not is_whole:
         raise RequestError(f"{path}: 'run_start' and 'run_length' do not divide the frames")
-    norms = np.linalg.norm(motion.orientation.astype(float), axis=1)
-    if np.any(np.abs(norms - 1) > 1e-5):  # float32 quaternions are unit to 1e-7
-        raise RequestError(f"{path}: 'orientation' holds quaternions that are not of unit length")
+    for index, start in enumerate(motion.run_start):
+        if np.any(np.diff(motion.time[motion.run(index)]) <= 0):
+            raise RequestError(f"{path}: 'time' does not increase in the run from frame {start} on")
     return motion

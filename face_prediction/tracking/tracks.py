@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.npz import read_npz, require_array, require_json, write_npz
+from robo_manip_baselines.runs.npz import ArrayType, FileType, read_json_array, read_npz, write_npz
 
 SCHEMA = "face_track"
 VERSION = 1
@@ -24,19 +24,36 @@ NUM_LANDMARKS = 468
 Size = tuple[int, int]
 """Width and height of an image in pixels, as displayed."""
 
-_ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
-    "landmarks": ("float32", ("T", NUM_LANDMARKS, 3)),
-    "valid": ("bool", ("T",)),
-    "interpolated": ("bool", ("T",)),
-    "timestamps": ("float64", ("T",)),
-    "head_pose": ("float64", ("T", 4, 4)),
-    "jaw": ("float32", ("T",)),
-    "image_size": ("int64", (2,)),
-    "fps": ("float64", ()),
-    "source_timestamps": ("float64", ("S",)),
-    "source_valid": ("bool", ("S",)),
+TRACK_FILE = FileType(
+    SCHEMA,
+    VERSION,
+    {
+        # Frames without a face are NaN.
+        "landmarks": ArrayType("f", ("T", NUM_LANDMARKS, 3), "any"),
+        "valid": ArrayType("b", ("T",)),
+        "interpolated": ArrayType("b", ("T",)),
+        "timestamps": ArrayType("f", ("T",), "increasing"),
+        "head_pose": ArrayType("f", ("T", 4, 4), "any"),
+        "jaw": ArrayType("f", ("T",), "any"),
+        "image_size": ArrayType("iu", (2,), "positive"),
+        "fps": ArrayType("f", (), "positive"),
+        "source_timestamps": ArrayType("f", ("S",)),
+        "source_valid": ArrayType("b", ("S",)),
+        "source": ArrayType("U"),
+        "detector": ArrayType("U"),
+    },
+    # Two hours at 60 frames a second.
+    limits={"T": 432_000, "S": 1_000_000},
+)
+"""Arrays of a track file."""
+
+_DTYPES = {
+    **dict.fromkeys(("landmarks", "jaw"), "float32"),
+    **dict.fromkeys(("valid", "interpolated", "source_valid"), "bool"),
+    **dict.fromkeys(("timestamps", "head_pose", "fps", "source_timestamps"), "float64"),
+    "image_size": "int64",
 }
-"""Type and shape of every array, in the order of the file."""
+"""Types that are written."""
 
 
 class NoFaceError(RequestError):
@@ -93,7 +110,7 @@ class FaceTrack:
 
 def save_track(path: Path, track: FaceTrack) -> None:
     """Write ``track`` to ``path``, whole or not at all."""
-    arrays = {name: np.asarray(getattr(track, name), kind) for name, (kind, _) in _ARRAYS.items()}
+    arrays = {name: np.asarray(getattr(track, name), kind) for name, kind in _DTYPES.items()}
     for name in ("source", "detector"):
         arrays[name] = np.array(json.dumps(dict(getattr(track, name)), sort_keys=True))
     write_npz(path, {"schema": np.array(SCHEMA), "version": np.array(VERSION), **arrays})
@@ -106,24 +123,14 @@ def load_track(path: Path) -> FaceTrack:
         RequestError: the file is absent, damaged, of another schema, or its arrays do not agree;
             the message names the file and the key.
     """
-    arrays = read_npz(path, SCHEMA, VERSION)
-    keys = {"T": "valid", "S": "source_valid"}
-    lengths = {n: len(require_array(path, arrays, key, (None,), "b")) for n, key in keys.items()}
-    values: dict[str, Any] = {}
-    for name, (dtype, shape) in _ARRAYS.items():
-        sizes = tuple(lengths[n] if isinstance(n, str) else n for n in shape)
-        kind = np.dtype(dtype).kind.replace("i", "iu")
-        values[name] = require_array(path, arrays, name, sizes, kind)
+    values: dict[str, Any] = read_npz(path, TRACK_FILE)
+    values |= {name: read_json_array(values, name, path) for name in ("source", "detector")}
     values["image_size"] = tuple(values["image_size"].tolist())
     values["fps"] = float(values["fps"])
-    values |= {name: require_json(path, arrays, name) for name in ("source", "detector")}
     track = FaceTrack(**values)
-    if min(track.image_size) <= 0 or not (np.isfinite(track.fps) and track.fps > 0):
-        wrong = f"image_size {track.image_size} and fps {track.fps}"
-        raise RequestError(f"{path}: {wrong} must be positive")
-    if not np.all(np.isfinite(track.timestamps)) or np.any(np.diff(track.timestamps) <= 0):
-        raise RequestError(f"{path}: 'timestamps' must be finite and increasing")
     for key in ("landmarks", "head_pose"):
         if not np.all(np.isfinite(getattr(track, key)[track.valid])):
             raise RequestError(f"{path}: '{key}' holds NaN or infinity in a frame marked valid")
+    if np.any(track.jaw < 0) or np.any(np.isinf(track.jaw)):
+        raise RequestError(f"{path}: 'jaw' holds distances that are negative or infinite")
     return track

@@ -14,7 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.face.motion import PREDICTION, MotionLibrary
+from robo_manip_baselines.envs.mujoco.face.motion import (
+    LIBRARY_FILE,
+    PREDICTION,
+    MotionLibrary,
+    read_library,
+)
 from robo_manip_baselines.observation import MAX_HORIZON
 from robo_manip_baselines.runs.npz import write_npz
 
@@ -56,7 +61,10 @@ def write_library(path: Path, source: Path | None, forecast: str) -> None:
         RequestError: the library cannot be used.
     """
     library = MotionLibrary.load(source)
-    with library.source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-        content = {name: archive[name] for name in archive.files}
+    content = {
+        "schema": np.array(LIBRARY_FILE.schema),
+        "version": np.array(LIBRARY_FILE.version),
+        **read_library(library.source),
+    }
     content[PREDICTION] = FORECASTS[forecast](library).astype(np.float32)
     write_npz(path, content)

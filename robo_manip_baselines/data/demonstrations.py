@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from robo_manip_baselines.data.episode import EpisodeReader, read_metadata
 from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_episodes, seed_of
 from robo_manip_baselines.data.schema import POLICY_ATTRIBUTES
+from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import ObservationSpec, State
 from robo_manip_baselines.observation.corruption import NO_PREDICTION
 from robo_manip_baselines.runs.errors import RequestError
@@ -137,7 +138,8 @@ class Demonstrations:
         control_period: s between rows.
         xml_hash: of the simulator's model.
         env_kwargs: what the environment was made with, but for what ``spec`` says.
-        content_hash: SHA-256 over the content hashes of the files, in order.
+        content_hash: SHA-256 over the content hashes of the files, in order, each of which was
+            compared with what the file holds.
     """
 
     paths: tuple[Path, ...]
@@ -192,7 +194,7 @@ def load_demonstrations(
         RequestError: no such folder, no or not enough episodes in it, episodes that do not belong
             together, something in ``spec`` that they do not hold, or error statistics that cannot
             be used. Says what to do.
-        EpisodeFileError: a file is damaged.
+        EpisodeFileError: a file is damaged, was changed after it was recorded, or is in use.
     """
     folder = Path(folder)
     # With the digest of the statistics, so that a policy is evaluated with those it learnt from.
@@ -269,7 +271,9 @@ def _require_same(
     first: Path, expected: Mapping[str, Any], path: Path, given: Mapping[str, Any]
 ) -> None:
     """Raise RequestError if two files are not of one kind."""
-    ours, theirs = ({**item, "env_kwargs": _world(item)} for item in (expected, given))
+    ours, theirs = (
+        {**item, "env_kwargs": without_library_path(_world(item))} for item in (expected, given)
+    )
     for name in (*POLICY_ATTRIBUTES, "env_kwargs"):
         if theirs[name] != ours[name]:
             raise RequestError(

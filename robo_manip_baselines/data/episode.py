@@ -5,9 +5,9 @@ Images are RGB, (H, W, 3) uint8, and stored as JPEG, PNG or raw.
 
 from __future__ import annotations
 
-import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from robo_manip_baselines.data.schema import (
     READABLE_VERSIONS,
     SCHEMA,
     EpisodeSchema,
+    attribute_problems,
     content_digest,
     episode_consistency,
     loaded_attribute,
@@ -30,16 +31,20 @@ from robo_manip_baselines.data.schema import (
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, entry_of_id
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import atomic_file
-from robo_manip_baselines.runs.images import CODECS, decode_image
+from robo_manip_baselines.runs.hdf5 import (
+    READ_ERRORS,
+    attribute_of,
+    dataset_of,
+    one_line,
+    open_hdf5,
+    read_whole,
+)
+from robo_manip_baselines.runs.images import CODECS, decode_image, encoded_size
 
 
 def image_checksum(data: np.ndarray) -> int:
     """CRC-32 of an encoded image, as kept beside it in the episode file."""
     return zlib.crc32(np.ascontiguousarray(data).reshape(-1).data)
-
-
-# Whatever HDF5 and h5py raise on damaged bytes.
-READ_ERRORS = (KeyError, ValueError, OSError, RuntimeError, TypeError, OverflowError, MemoryError)
 
 
 class EpisodeFileError(RequestError):
@@ -59,8 +64,9 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 class EpisodeReader:
     """An open episode file. Nothing but attributes is read until it is asked for.
 
-    Use as a context manager. Numbers and frames are checked against their checksums as they are
-    read, so that damage is an error and never wrong data.
+    Use as a context manager. Arrays are read together, once, and checked against the schema and
+    the digest of the file's content; frames are checked against their checksums as they are read.
+    Damage and edits are errors, and never wrong data.
 
     Attributes:
         path: the file.
@@ -75,15 +81,17 @@ class EpisodeReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._frames: dict[str, FrameStore] = {}
-        self._file = open_hdf5(self.path)
+        self._file = open_episode(self.path)
         try:
             require_schema(self.path, self._file)
             self.task = task_of(self._file)
             self.schema = EpisodeSchema.of(self.task)
             self.attributes = {
-                item.name: loaded_attribute(item, self._file.attrs[item.name])
+                item.name: loaded_attribute(item, attribute_of(self._file, item.name))
                 for item in self.schema.attributes
             }
+            if problems := attribute_problems(self.task, self.attributes):
+                raise ValueError(problems[0])
         except READ_ERRORS as error:
             self._file.close()
             if isinstance(error, RequestError):
@@ -109,25 +117,46 @@ class EpisodeReader:
         """Names of the fields that the file holds."""
         return self.schema.fields_of(self.attributes["schema_version"], self._file)
 
-    @property
+    @cached_property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Every field that the file holds, read from the file at each call."""
-        return {name: self.array(name) for name in self.fields}
+        """Every field that the file holds, read together and checked against the file's digest.
+
+        Raises:
+            EpisodeFileError: one is missing or damaged, or the file was edited after recording.
+        """
+        try:
+            datasets, problems = field_datasets(self._file, self.schema, self.fields)
+            problems += shape_problems(self.schema, {n: item.shape for n, item in datasets.items()})
+            problems += episode_consistency(self.attributes, datasets)
+            if problems:
+                raise ValueError(problems[0])
+            arrays = {name: read_whole(item) for name, item in datasets.items()}
+            for name, values in arrays.items():
+                phases = len(self.attributes["phase_names"])
+                if problems := value_problems(self.schema.by_name[name], values, phases):
+                    raise ValueError(problems[0])
+            checksums = {camera: self._frame_store(camera).checksum for camera in self.cameras}
+            digest = content_digest(self.schema, arrays, checksums, self.attributes)
+            if digest != self.attributes["content_sha256"]:
+                raise ValueError("it was changed after it was recorded (its SHA-256 is another)")
+        except READ_ERRORS as error:
+            raise EpisodeFileError(
+                f"'{self.path}' cannot be used: {one_line(error)}; record this episode again, or "
+                "remove the file"
+            ) from error
+        return arrays
 
     def array(self, name: str) -> np.ndarray:
-        """One field, all steps.
+        """One field, all steps; see `arrays`.
 
         Raises:
             RequestError: for an unknown name.
-            EpisodeFileError: if it is missing or damaged.
+            EpisodeFileError: if the file lacks it, is damaged, or was edited after recording.
         """
         require_choice("field", name, self.schema.by_name)
-        try:
-            return np.asarray(dataset_of(self._file, name)[()])
-        except READ_ERRORS as error:
-            raise EpisodeFileError(
-                f"'{self.path}': '{name}' cannot be read: {one_line(error)}"
-            ) from error
+        if name not in self.arrays:
+            raise EpisodeFileError(f"'{self.path}': '{name}' is missing")
+        return self.arrays[name]
 
     def encoded_frame(self, camera: str, step: int) -> np.ndarray:
         """The bytes of one image, (N,) uint8; with the codec ``raw`` the (H, W, 3) image.
@@ -140,9 +169,10 @@ class EpisodeReader:
         if not 0 <= step < len(self):
             raise RequestError(f"'{self.path}' has steps 0…{len(self) - 1}, not {step}")
         try:
-            if camera not in self._frames:
-                self._frames[camera] = FrameStore(self._file, camera, len(self))
-            return self._frames[camera].encoded(step)
+            data = self._frame_store(camera).encoded(step)
+            if list(size := encoded_size(data)) != self.attributes["image_size"]:
+                raise ValueError(f"it is {size}, not {self.attributes['image_size']}")
+            return data
         except READ_ERRORS as error:
             raise EpisodeFileError(
                 f"'{self.path}': frame {step} of '{camera}' cannot be read: {one_line(error)}"
@@ -158,6 +188,12 @@ class EpisodeReader:
                 f"'{self.path}': frame {step} of '{camera}': {one_line(error)}"
             ) from error
 
+    def _frame_store(self, camera: str) -> FrameStore:
+        if camera not in self._frames:
+            size = self.attributes["image_size"]
+            self._frames[camera] = FrameStore(self._file, camera, len(self), size)
+        return self._frames[camera]
+
     def close(self) -> None:
         """Close the file; may be called again."""
         self._file.close()
@@ -170,15 +206,31 @@ class FrameStore:
         KeyError, ValueError, OSError: see `READ_ERRORS`; if something is missing or damaged.
     """
 
-    def __init__(self, file: h5py.File, camera: str, num_steps: int) -> None:
+    def __init__(self, file: h5py.File, camera: str, num_steps: int, size: Sequence[int]) -> None:
         group = f"{IMAGE_GROUP}/{camera}"
         self._data = dataset_of(file, f"{group}/data")
-        self.checksum: np.ndarray = dataset_of(file, f"{group}/checksum")[()]
+        checksum = dataset_of(file, f"{group}/checksum")
         is_joined = self._data.ndim == 1
-        self._offset = dataset_of(file, f"{group}/offset")[()] if is_joined else None
-        frames = len(self._data) if self._offset is None else len(self._offset) - 1
-        if frames != num_steps or self.checksum.shape != (num_steps,):
+        offset = dataset_of(file, f"{group}/offset") if is_joined else None
+        frames = len(self._data) if offset is None else len(offset) - 1
+        if frames != num_steps or checksum.shape != (num_steps,):
             raise ValueError(f"{frames} frames instead of {num_steps}")
+        if self._data.dtype != np.uint8 or checksum.dtype != np.uint32:
+            raise ValueError(f"bytes of type {self._data.dtype}, checksums {checksum.dtype}")
+        self.checksum: np.ndarray = read_whole(checksum)
+        self._offset = None
+        if offset is None:
+            if self._data.shape != (num_steps, *size, 3):
+                raise ValueError(f"frames of shape {self._data.shape[1:]}, not {(*size, 3)}")
+            return
+        if offset.dtype != np.int64 or offset.ndim != 1:
+            raise ValueError(f"offsets of type {offset.dtype}")
+        place = self._offset = read_whole(offset)
+        sizes = np.diff(place)
+        if place[0] or place[-1] != len(self._data):
+            raise ValueError("its offsets do not divide its bytes")
+        if sizes.min() < 0 or sizes.max() > 4 * int(np.prod(size)) * 3 + _CHUNK_BYTES:
+            raise ValueError(f"a frame of {sizes.min()} or {sizes.max()} bytes")
 
     def encoded(self, step: int) -> np.ndarray:
         """One image as it was given to the writer; raises if it is not that any more."""
@@ -190,31 +242,49 @@ class FrameStore:
         return data
 
 
-def open_hdf5(path: Path) -> h5py.File:
+def open_episode(path: Path) -> h5py.File:
     """Open for reading.
 
     Raises:
-        EpisodeFileError: if there is no such file, or it is no HDF5 file or a truncated one.
+        EpisodeFileError: if there is no such file, it is in use, or no HDF5 file or a truncated
+            one.
     """
-    if not path.is_file():
-        raise EpisodeFileError(f"'{path}' is no file")
     try:
-        return h5py.File(path, "r")
-    except PermissionError as error:
-        raise EpisodeFileError(f"'{path}' cannot be read: permission denied") from error
-    except (OSError, RuntimeError, KeyError) as error:
-        raise EpisodeFileError(
-            f"'{path}' is no HDF5 file, or a damaged one: {one_line(error)}"
-        ) from error
+        return open_hdf5(path)
+    except READ_ERRORS as error:
+        raise EpisodeFileError(f"'{path}' is {one_line(error)}") from error
+
+
+def field_datasets(
+    file: h5py.File, schema: EpisodeSchema, names: Iterable[str]
+) -> tuple[dict[str, h5py.Dataset], list[str]]:
+    """Return the arrays of these names whose type is right, and what is wrong with the others."""
+    found: dict[str, h5py.Dataset] = {}
+    problems: list[str] = []
+    for name in names:
+        field = schema.by_name[name]
+        try:
+            dataset = dataset_of(file, name)
+            if dataset.dtype != np.dtype(field.dtype):
+                raise TypeError(f"'{name}' is {dataset.dtype}, not {field.dtype}")
+        except KeyError:
+            problems.append(f"'{name}' is missing")
+            continue
+        except READ_ERRORS as error:
+            problems.append(one_line(error))
+            continue
+        found[name] = dataset
+    return found, problems
 
 
 def require_schema(path: Path, file: h5py.File) -> None:
     """Raise `EpisodeFileError` unless this is an episode of the version that this code reads."""
-    schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")
+    given = ("schema", "schema_version")
+    schema, version = (attribute_of(file, n) if n in file.attrs else None for n in given)
     schema = schema.decode(errors="replace") if isinstance(schema, bytes) else schema
     if schema != SCHEMA:
         raise EpisodeFileError(f"'{path}' is no episode: schema {schema!r}, not '{SCHEMA}'")
-    if version not in READABLE_VERSIONS:
+    if not isinstance(version, np.integer) or int(version) not in READABLE_VERSIONS:
         raise EpisodeFileError(
             f"'{path}' has schema version {version}; this release reads "
             f"{', '.join(map(str, READABLE_VERSIONS))}"
@@ -229,23 +299,7 @@ def task_of(file: h5py.File) -> TaskEntry:
         RequestError: no task of that id is registered here.
     """
     item = EpisodeSchema.of(None).attribute_by_name["env_id"]
-    return entry_of_id(loaded_attribute(item, file.attrs[item.name]))
-
-
-def dataset_of(file: h5py.File, name: str) -> h5py.Dataset:
-    """The dataset of that name; raises KeyError if there is none."""
-    dataset = file.get(name)
-    if not isinstance(dataset, h5py.Dataset):
-        raise KeyError(f"no dataset '{name}'")
-    return dataset
-
-
-def one_line(error: BaseException) -> str:
-    """The message of an exception as one line."""
-    message = error.args[0] if isinstance(error, KeyError) and error.args else error
-    if re.search("filter returned failure|Fletcher32", str(message)):  # HDF5 2 and 1 say it so
-        return "its checksum is wrong"
-    return " ".join(str(message).split())
+    return entry_of_id(loaded_attribute(item, attribute_of(file, item.name)))
 
 
 # From this release of the file format on, HDF5 keeps checksums of its own structure.
@@ -292,7 +346,8 @@ def write_episode(
         for camera, frames in sorted(images.items())
     }
     stored, loaded = _checked_attributes(schema, attributes, images, fields)
-    problems = episode_consistency(loaded, fields)
+    problems = attribute_problems(entry_of_id(attributes["env_id"]), loaded)
+    problems += episode_consistency(loaded, fields)
     phase = np.asarray(arrays["phase"])
     problems += value_problems(schema.by_name["phase"], phase, len(loaded["phase_names"]))
     if problems:
@@ -373,7 +428,7 @@ def _image_size(images: EncodedImages, codec: str, num_steps: int) -> tuple[int,
                 )
             if codec == "raw" and frame.shape != frames[0].shape:
                 raise ValueError(f"frame {step} of '{camera}' is {frame.shape}, unlike the first")
-        sizes[camera] = decode_image(frames[0]).shape[:2]
+        sizes[camera] = encoded_size(frames[0])
     if len(set(sizes.values())) > 1:
         raise ValueError(f"images differ in size: {sizes}")
     return next(iter(sizes.values()), (0, 0))

@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -19,7 +20,15 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robo_manip_baselines.envs.mujoco.tasks.registry import Attribute, Field, TaskEntry
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    Attribute,
+    Field,
+    TaskEntry,
+    env_kwargs_problem,
+)
+from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.runs.images import CODECS, MAX_SIDE
+from robo_manip_baselines.runs.npz import add_array, parse_json
 
 SCHEMA = "robo_manip_baselines/episode"
 SCHEMA_VERSION = 3
@@ -51,6 +60,14 @@ SYMBOLS: Mapping[str, str] = {
     "V": "simulator velocities (`model.nv`)",
 }
 ALLOWED_SIZES: Mapping[str, tuple[int, ...]] = {"A": (7, 14), "J": (6, 12), "G": (1, 2)}
+
+MAX_SIZES: Mapping[str, int] = {"T": 180_000, "Q": 1000, "V": 1000}
+"""Largest sizes: an hour at 50 steps a second. Checked before memory is taken."""
+
+MAX_BYTES = 2**30
+"""Total size of the arrays of an episode, without images."""
+
+_MAX_NAMES = 1000
 
 
 _STATE_FIELDS = (
@@ -244,7 +261,7 @@ def loaded_attribute(item: Attribute, value: Any) -> Any:
         value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
         if isinstance(value, bytes | str):
             text = value.decode() if isinstance(value, bytes) else value
-            return text if item.kind == "text" else json.loads(text)
+            return text if item.kind == "text" else parse_json(text, f"attribute '{item.name}'")
     elif isinstance(value, np.generic):
         kinds = {"bool": "b", "int": "i", "float": "f"}
         if value.dtype.kind == kinds[item.kind]:
@@ -272,19 +289,70 @@ def content_digest(
     digest = hashlib.sha256()
     for field in schema.fields:
         if field.name in arrays:
-            _add_array(digest, field.name, np.asarray(arrays[field.name]).astype(field.dtype))
+            array = np.asarray(arrays[field.name])
+            add_array(digest, field.name, array.astype(field.dtype, copy=False))
     for camera in sorted(checksums):
-        _add_array(digest, camera, np.asarray(checksums[camera], dtype=np.uint32))
+        add_array(digest, camera, np.asarray(checksums[camera], dtype=np.uint32))
     for item in schema.attributes:
         if item.name != "content_sha256":
             digest.update(f"{item.name}={_canonical(attributes[item.name])}\n".encode())
     return digest.hexdigest()
 
 
+def attribute_problems(task: TaskEntry | None, attributes: Mapping[str, Any]) -> list[str]:
+    """Return what is wrong with the values of attributes, as `loaded_attribute` gives them."""
+
+    def is_list(kind: type, length: int | None = None) -> Callable[[Any], bool]:
+        return lambda value: (
+            isinstance(value, list)
+            and all(type(item) is kind for item in value)
+            and len(value) in (range(_MAX_NAMES + 1) if length is None else (length,))
+            and (kind is not str or len(set(value)) == len(value))
+        )
+
+    rules: dict[str, tuple[Callable[[Any], bool], str]] = {
+        "num_steps": (lambda x: 1 <= x <= MAX_SIZES["T"], f"must be 1 to {MAX_SIZES['T']}"),
+        "seed": (lambda x: x >= 0, "must be 0 or more"),
+        "control_period": (lambda x: 0.0 < x < math.inf, "must be positive"),
+        "prediction_period": (lambda x: 0.0 < x < math.inf, "must be positive"),
+        "completion_time": (lambda x: math.isnan(x) or 0.0 <= x < math.inf, "must be 0 or more"),
+        "image_codec": (lambda x: x in CODECS, f"must be one of {', '.join(CODECS)}"),
+        **{
+            name: (lambda x: bool(x) and is_list(str)(x), "must be a list of different names")
+            for name in ("phase_names", "joint_names", "action_names")
+        },
+        "cameras": (
+            lambda x: is_list(str)(x) and set(x) <= set(CAMERAS),
+            f"must be a list of some of {', '.join(CAMERAS)}",
+        ),
+        "image_size": (
+            lambda x: is_list(int, 2)(x) and min(x) >= 0 and max(x) <= MAX_SIDE,
+            f"must be height and width, at most {MAX_SIDE}",
+        ),
+        "versions": (
+            lambda x: isinstance(x, dict) and all(isinstance(v, str) for v in x.values()),
+            "must be an object of texts",
+        ),
+        "xml_hash": (
+            lambda x: bool(re.fullmatch("[0-9a-f]{64}", x)),
+            "must be 64 hexadecimal digits",
+        ),
+        "env_kwargs": (lambda x: not env_kwargs_problem(task, x), ""),
+    }
+    problems = []
+    for name, (is_valid, valid) in rules.items():
+        if name in attributes and not is_valid(attributes[name]):
+            wrong = f"is {str(attributes[name])[:80]!r}; it {valid}"
+            if name == "env_kwargs":
+                wrong = env_kwargs_problem(task, attributes[name])
+            problems.append(f"attribute '{name}' {wrong}")
+    return problems
+
+
 def episode_consistency(
-    attributes: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    attributes: Mapping[str, Any], arrays: Mapping[str, np.ndarray | h5py.Dataset]
 ) -> list[str]:
-    """Return contradictions between attributes and arrays."""
+    """Return contradictions between attributes and the shapes of arrays."""
     problems: list[str] = []
     axes = (("joint_names", "joint_position", 1), ("action_names", "action", 1))
     for name, field, axis in (*axes, ("num_steps", "time", 0)):
@@ -295,12 +363,6 @@ def episode_consistency(
             if given != size:
                 problems.append(f"attribute '{name}' says {given}, but '{field}' has {size}")
     return problems
-
-
-def _add_array(digest: Any, name: str, array: np.ndarray) -> None:
-    array = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False)
-    digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-    digest.update(np.ascontiguousarray(array).tobytes())
 
 
 def _canonical(value: Any) -> str:
@@ -341,6 +403,13 @@ def shape_problems(schema: EpisodeSchema, shapes: Mapping[str, tuple[int, ...]])
         if size < 1 or (allowed and size not in allowed):
             valid = " or ".join(map(str, allowed)) if allowed else "at least 1"
             problems.append(f"'{owner}' has {symbol}={size}, not {valid}")
+        elif size > MAX_SIZES.get(symbol, size):
+            problems.append(f"'{owner}' has {symbol}={size}, more than {MAX_SIZES[symbol]}")
+    if not problems:
+        bytes_of = {f.name: np.dtype(f.dtype).itemsize for f in schema.fields}
+        total = sum(math.prod(shape) * bytes_of.get(name, 0) for name, shape in shapes.items())
+        if total > MAX_BYTES:
+            problems.append(f"the arrays have {total} bytes, more than {MAX_BYTES}")
     return problems
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from tqdm import tqdm
 
 from robo_manip_baselines.data.episode import (
-    READ_ERRORS,
     EpisodeFileError,
     FrameStore,
-    one_line,
-    open_hdf5,
+    field_datasets,
+    open_episode,
     require_schema,
     task_of,
 )
@@ -28,13 +27,22 @@ from robo_manip_baselines.data.schema import (
     IMAGE_GROUP,
     POLICY_ATTRIBUTES,
     EpisodeSchema,
+    attribute_problems,
     content_digest,
     episode_consistency,
     loaded_attribute,
     shape_problems,
     value_problems,
 )
+from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, without_library_path
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.hdf5 import (
+    READ_ERRORS,
+    attribute_of,
+    one_line,
+    read_whole,
+    require_own_links,
+)
 from robo_manip_baselines.runs.images import decode_image
 
 SHARED_ATTRIBUTES = (*POLICY_ATTRIBUTES, "env_kwargs", "cameras", "image_size")
@@ -69,7 +77,7 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
 def _metadata(path: Path) -> dict[str, Any]:
     """Return the attributes that can be read; damage has been reported already."""
     try:
-        with open_hdf5(path) as file:
+        with open_episode(path) as file:
             return readable_attributes(file, _schema(file))[0]
     except (EpisodeFileError, *READ_ERRORS):
         return {}
@@ -80,7 +88,7 @@ def _mixed(metadata: dict[Path, dict[str, Any]]) -> list[Problem]:
     problems: list[Problem] = []
     for name in SHARED_ATTRIBUTES:
         values = {
-            path: json.dumps(attributes[name], sort_keys=True)
+            path: json.dumps(_comparable(name, attributes[name]), sort_keys=True)
             for path, attributes in metadata.items()
             if name in attributes
         }
@@ -93,6 +101,11 @@ def _mixed(metadata: dict[Path, dict[str, Any]]) -> list[Problem]:
                 if value != usual
             ]
     return problems
+
+
+def _comparable(name: str, value: Any) -> Any:
+    is_kwargs = name == "env_kwargs" and isinstance(value, dict)
+    return without_library_path(value) if is_kwargs else value
 
 
 def _misplaced(metadata: dict[Path, dict[str, Any]]) -> list[Problem]:
@@ -142,7 +155,7 @@ def verify_file(path: str | Path, *, images: bool = True) -> list[Problem]:
     """
     path = Path(path)
     try:
-        with open_hdf5(path) as file:
+        with open_episode(path) as file:
             require_schema(path, file)
             return _file_problems(path, file, _schema(file), images)
     except EpisodeFileError as error:
@@ -153,32 +166,49 @@ def verify_file(path: str | Path, *, images: bool = True) -> list[Problem]:
 
 def _schema(file: h5py.File) -> EpisodeSchema:
     """Return the schema of the file's task; what all tasks share if that cannot be read."""
+    return EpisodeSchema.of(_task(file))
+
+
+def _task(file: h5py.File) -> TaskEntry | None:
+    """Return the file's task; None if the attribute that names it cannot be read."""
     try:
-        return EpisodeSchema.of(task_of(file))
+        return task_of(file)
     except READ_ERRORS as error:
         if isinstance(error, RequestError):
             raise EpisodeFileError(str(error)) from error
-        return EpisodeSchema.of(None)
+        return None
 
 
 def _file_problems(
     path: Path, file: h5py.File, schema: EpisodeSchema, images: bool
 ) -> list[Problem]:
     attributes, messages = readable_attributes(file, schema)
-    arrays, found = _arrays(file, schema, attributes.get("schema_version", 1))
-    messages += found
-    wrong_shapes = shape_problems(schema, {name: a.shape for name, a in arrays.items()})
-    messages += wrong_shapes
-    phases = attributes.get("phase_names")
+    messages += attribute_problems(_task(file), attributes)
+    present = schema.fields_of(attributes.get("schema_version", 1), file)
+    datasets, found = field_datasets(file, schema, present)
+    wrong_shapes = shape_problems(schema, {n: item.shape for n, item in datasets.items()})
+    messages += found + wrong_shapes
+    arrays: dict[str, np.ndarray] = {}
     if not wrong_shapes:
+        phases = attributes.get("phase_names")
         number = len(phases) if isinstance(phases, list) else None
-        for name, array in arrays.items():
-            messages += value_problems(schema.by_name[name], array, number)
-        messages += episode_consistency(attributes, arrays)
+        messages += episode_consistency(attributes, datasets)
+        for name, dataset in datasets.items():
+            try:
+                unit = attribute_of(dataset, "unit") if "unit" in dataset.attrs else b""
+                arrays[name] = read_whole(dataset)
+            except READ_ERRORS as error:
+                messages.append(f"'{name}' cannot be read: {one_line(error)}")
+                continue
+            unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
+            if unit != (wanted := schema.by_name[name].unit):
+                messages.append(f"'{name}' is in {unit!r}, not in '{wanted}'")
+            messages += value_problems(schema.by_name[name], arrays[name], number)
     checksums: dict[str, np.ndarray] = {}
     for camera in _names(attributes.get("cameras")):
         try:
-            frames = FrameStore(file, camera, attributes.get("num_steps", 0))
+            steps, size = attributes.get("num_steps", 0), attributes.get("image_size", [])
+            frames = FrameStore(file, camera, steps, size)
         except READ_ERRORS as error:
             messages.append(f"'{IMAGE_GROUP}/{camera}' cannot be read: {one_line(error)}")
             continue
@@ -202,35 +232,10 @@ def readable_attributes(file: h5py.File, schema: EpisodeSchema) -> tuple[dict[st
             problems.append(f"attribute '{item.name}' is missing")
             continue
         try:
-            attributes[item.name] = loaded_attribute(item, file.attrs[item.name])
+            attributes[item.name] = loaded_attribute(item, attribute_of(file, item.name))
         except READ_ERRORS as error:
             problems.append(f"attribute '{item.name}' cannot be read: {one_line(error)}")
     return attributes, problems
-
-
-def _arrays(
-    file: h5py.File, schema: EpisodeSchema, version: int
-) -> tuple[dict[str, np.ndarray], list[str]]:
-    arrays: dict[str, np.ndarray] = {}
-    problems: list[str] = []
-    for name in schema.fields_of(version, file):
-        field, dataset = schema.by_name[name], file.get(name)
-        if not isinstance(dataset, h5py.Dataset):
-            problems.append(f"'{name}' is missing")
-            continue
-        if dataset.dtype != np.dtype(field.dtype):
-            problems.append(f"'{name}' is {dataset.dtype}, not {field.dtype}")
-            continue
-        try:
-            arrays[name] = np.asarray(dataset[()])
-        except READ_ERRORS as error:
-            problems.append(f"'{name}' cannot be read: {one_line(error)}")
-            continue
-        unit = dataset.attrs.get("unit", b"")
-        unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
-        if unit != field.unit:
-            problems.append(f"'{name}' is in {unit!r}, not in '{field.unit}'")
-    return arrays, problems
 
 
 def _image_problems(frames: FrameStore, camera: str, attributes: dict[str, Any]) -> Iterable[str]:
@@ -263,6 +268,7 @@ def _unknown(file: h5py.File, schema: EpisodeSchema, attributes: dict[str, Any])
     cameras = set(_names(attributes.get("cameras")))
     members = file.get(IMAGE_GROUP)
     if isinstance(members, h5py.Group):
+        require_own_links(members)
         yield from (f"key '{IMAGE_GROUP}/{name}'" for name in members if name not in cameras)
 
 

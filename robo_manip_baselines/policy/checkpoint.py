@@ -32,6 +32,7 @@ from robo_manip_baselines.runs.checkpoints import (
     write_json,
 )
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.tensors import read_tensors, require_alike, require_finite
 
 if TYPE_CHECKING:
     import torch
@@ -142,18 +143,28 @@ def load_model(checkpoint: Checkpoint, device: torch.device | str = "cpu") -> Po
     Raises:
         RequestError: the weights do not fit the network.
     """
-    import safetensors.torch
-
     config = without_initial_weights(checkpoint.config)
     model = make_model(checkpoint.policy, config, checkpoint.dims)
-    state = safetensors.torch.load_file(checkpoint.folder / MODEL)
+    model.load_state_dict(read_weights(checkpoint, model.state_dict()))
+    return model.to(device).eval()
+
+
+def read_weights(checkpoint: Checkpoint, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Read the weights for evaluation, of the names, types and shapes of ``wanted``.
+
+    Raises:
+        RequestError: they do not fit, or hold NaN or infinity; names the tensor.
+    """
+    path = verify(checkpoint.folder, read_manifest(checkpoint.folder), MODEL)
+    state, _ = read_tensors(path)
     try:
-        model.load_state_dict(state)
-    except RuntimeError as error:
+        require_alike(state, wanted, MODEL)
+        require_finite(state, MODEL)
+    except RequestError as error:
         raise RequestError(
             f"checkpoint '{checkpoint.folder}' does not fit {checkpoint.policy}: {error}"
         ) from error
-    return model.to(device).eval()
+    return state
 
 
 def without_initial_weights(config: Any) -> Any:
@@ -211,10 +222,8 @@ def read_trainer(checkpoint: Checkpoint) -> tuple[dict[str, Tensor], dict[str, A
     Raises:
         RequestError: it is missing or damaged.
     """
-    import safetensors.torch
-
     digests = read_manifest(checkpoint.folder)
-    tensors = safetensors.torch.load_file(verify(checkpoint.folder, digests, TRAINER_TENSORS))
+    tensors, _ = read_tensors(verify(checkpoint.folder, digests, TRAINER_TENSORS))
     return tensors, read_json(verify(checkpoint.folder, digests, TRAINER))
 
 

@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,8 +29,14 @@ from robo_manip_baselines.data import (
     remove_partial_episodes,
     write_episode,
 )
+from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
-from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id, make_env, task_entry
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    entry_of_id,
+    make_env,
+    task_entry,
+    without_library_path,
+)
 from robo_manip_baselines.policy.presets import require_at_least
 from robo_manip_baselines.rollout.results import completion_time, require_seeds
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -88,9 +94,12 @@ def demonstrate(
         rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated
     time = info["completion_time"]
+    env_kwargs = dict(env.spec.kwargs)
+    if env_kwargs.get("motion_library"):
+        env_kwargs["motion_sha256"] = world.library.sha256
     attributes = {
         "env_id": env.spec.id,
-        "env_kwargs": dict(env.spec.kwargs),
+        "env_kwargs": env_kwargs,
         **start,
         "is_success": info["is_success"],
         "is_success_strict": info["is_success_strict"],
@@ -187,6 +196,7 @@ def collect(collection: Collection) -> CollectionSummary:
         RequestError: the request cannot be met; nothing has been written then.
     """
     # Everything about the request that can be wrong is found out here, before any file exists.
+    collection = replace(collection, env_kwargs=pin_library(collection.env_kwargs))
     with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
         _require_fitting_expert(collection, env)
         _refuse_other_settings(collection, world_of(env).xml_hash)
@@ -304,10 +314,11 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     present = next((path for seed in done if (path := collection.path(seed))), None)
     if present is None:
         return
-    there = read_metadata(present)
+    recorded = read_metadata(present)
+    there = {**recorded, "env_kwargs": without_library_path(recorded["env_kwargs"])}
     wanted = {
         "env_id": task_entry(collection.env).env_id,
-        "env_kwargs": collection.env_kwargs,
+        "env_kwargs": without_library_path(collection.env_kwargs),
         "expert": collection.expert,
         "image_codec": collection.codec,
         "image_quality": collection.quality,
@@ -348,14 +359,16 @@ def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any
     """
     recorded = episode.attributes
     task = entry_of_id(recorded["env_id"])
-    env = make_env(task.name, **{**recorded["env_kwargs"], **changes})
+    kwargs = {**recorded["env_kwargs"], **changes}
+    kwargs.pop("error", None)  # of older releases; it says what was shown
+    env = make_env(task.name, **kwargs)
     xml_hash = world_of(env).xml_hash
     if xml_hash != recorded["xml_hash"]:
         env.close()
         raise RequestError(
             f"'{episode.path}' was recorded with another model (hash {recorded['xml_hash'][:12]}, "
             f"here {xml_hash[:12]}); install the release that recorded it, "
-            f"{recorded['versions']['robo_manip_baselines']}"
+            f"{recorded['versions'].get('robo_manip_baselines', 'unknown')}"
         )
     return env
 

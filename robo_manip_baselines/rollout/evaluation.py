@@ -15,7 +15,9 @@ from tqdm import tqdm
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model, read_checkpoint
 from robo_manip_baselines.policy.presets import ActionExecution, require_at_least
@@ -156,7 +158,10 @@ class EvaluationPlan:
         if config.corruption is not None:
             spec = replace(spec, corruption=config.corruption.pinned())
         recorded = checkpoint.dataset.get("env_kwargs", {})
-        env = EnvConfig(checkpoint.env, spec, {**recorded, **config.env_kwargs})
+        if "motion_library" in config.env_kwargs:  # another file, of other content perhaps
+            recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
+        env_kwargs = pin_library({**recorded, **config.env_kwargs})
+        env = EnvConfig(checkpoint.env, spec, env_kwargs)
         _require_fit(checkpoint, env)
         if (spec.cameras or config.videos) and (problem := opengl_problem()):
             why = "the policy sees images" if spec.cameras else "--video 0 needs no OpenGL"
@@ -202,7 +207,7 @@ class EvaluationPlan:
         del acting["execute" if self.execution.temporal_ensemble else "decay"]
         return {
             "env": self.env.task.env_id,
-            "env_kwargs": self.env.env_kwargs,
+            "env_kwargs": without_library_path(self.env.env_kwargs),
             "observation": self.env.spec.to_json(),
             "xml_hash": self.checkpoint.xml_hash,
             "policy": self.checkpoint.policy,
@@ -221,6 +226,7 @@ class EvaluationPlan:
             "checkpoint_step": self.checkpoint.step,
             "train_seed": self.checkpoint.train_seed,
             "first_seed": self.config.seeds[0],
+            "motion_library": self.env.env_kwargs.get("motion_library"),
         }
 
     def make_policy(self, num_envs: int) -> ActingPolicy:
@@ -246,6 +252,7 @@ class EvaluationPlan:
             "observation": json.loads(json.dumps(self.env.spec.to_json())),
             "train_seed": checkpoint.train_seed,
             "checkpoint": checkpoint.content_hash,
+            "motion_sha256": MotionLibrary.load(self.env.env_kwargs.get("motion_library")).sha256,
             "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),
         }
         with (

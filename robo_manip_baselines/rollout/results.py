@@ -58,6 +58,7 @@ class EpisodeResult:
         observation: spec of what the policy was shown, as JSON; null in rows of version 1
         train_seed: seed of the training run; null for a policy that was not trained
         checkpoint: hash of the checkpoint's contents
+        motion_sha256: SHA-256 of the library of recorded motion; empty in rows of older releases
         versions: of the software
     """
 
@@ -76,6 +77,7 @@ class EpisodeResult:
     observation: dict[str, Any] | None = None
     train_seed: int | None = None
     checkpoint: str = ""
+    motion_sha256: str = ""
     versions: dict[str, str] = field(default_factory=dict)
 
     def to_line(self) -> str:
@@ -101,6 +103,7 @@ class EpisodeResult:
                 values["condition"] = values.pop("arm")
         elif version != ROW_VERSION:
             raise ValueError(f"'version' is {version}; this release reads 1 and {ROW_VERSION}")
+        values.setdefault("motion_sha256", "")
         hints = typing.get_type_hints(cls)
         hints.pop("columns")
         given = {name: _checked(values, name, hint) for name, hint in hints.items()}

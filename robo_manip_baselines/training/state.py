@@ -14,13 +14,18 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from robo_manip_baselines.policy.checkpoint import MODEL, Checkpoint, read_trainer
+from robo_manip_baselines.policy.checkpoint import (
+    TRAINER_TENSORS,
+    Checkpoint,
+    read_trainer,
+    read_weights,
+)
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import TrainSettings
+from robo_manip_baselines.runs.tensors import require_alike, require_finite
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -176,8 +181,20 @@ class TrainerState:
         Raises:
             RequestError: the checkpoint lacks the trainer's state, or it is damaged.
         """
-        weights = safetensors.torch.load_file(checkpoint.folder / MODEL)
+        wanted = self.model.state_dict()
+        weights = read_weights(checkpoint, wanted)
         tensors, json = read_trainer(checkpoint)
+        source = checkpoint.folder / TRAINER_TENSORS
+        expected = {f"weights/{name}": value for name, value in wanted.items() if self.average}
+        expected |= {
+            f"{moment}/{name}": parameter.detach()
+            for name, parameter in self._named()
+            for moment in _MOMENTS
+            if name in json["optimizer_steps"]
+        }
+        state = {name: value for name, value in tensors.items() if name != "metrics"}
+        require_alike(state, expected, source)
+        require_finite(state, source)
         if self.average:
             self.average.model.load_state_dict(weights)
             prefix = "weights/"

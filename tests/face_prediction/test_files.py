@@ -102,7 +102,7 @@ def with_nan(key: str, index: int = 0) -> Callable[[dict[str, np.ndarray]], None
         (with_value("valid", np.ones(40)), "'valid' is float64"),
         (with_value("source", "not json"), "'source' is not a JSON object"),
         (with_value("fps", 0.0), "must be positive"),
-        (with_value("timestamps", np.zeros(40)), "'timestamps' must be finite and increasing"),
+        (with_value("timestamps", np.zeros(40)), "'timestamps' does not increase at row 1"),
         (with_nan("landmarks", 3), "'landmarks' holds NaN"),
         (with_nan("head_pose", 39), "'head_pose' holds NaN"),
     ],

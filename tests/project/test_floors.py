@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -104,3 +105,24 @@ def test_runs_know_no_faces_and_no_robots(repository: Path) -> None:
             for alias in node.names
         }
         assert not top & heavy, path
+
+
+OPENERS = {
+    r"np\.load\b|np\.lib\.format|\bNpzFile\b|_MAGIC = b.*NUMPY": "runs/npz.py",
+    r"safetensors\.torch\.load|safe_open|import load_file": "runs/tensors.py",
+    r"h5py\.File\(.*\"r\"": "runs/hdf5.py",
+}
+"""What opens a file of arrays -> the one module that may, for it checks sizes before reading."""
+
+
+@pytest.mark.parametrize("pattern", OPENERS)
+def test_one_module_opens_each_kind_of_array_file(pattern: str, repository: Path) -> None:
+    found = {
+        path.relative_to(repository / "robo_manip_baselines").as_posix()
+        if path.is_relative_to(repository / "robo_manip_baselines")
+        else str(path)
+        for package in FLOORS
+        for path in (repository / package).rglob("*.py")
+        if re.search(pattern, path.read_text(encoding="utf-8"))
+    }
+    assert found == {OPENERS[pattern]}

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.tensors import read_tensors, require_finite
 
 STRIDE = 32
 """Pixels of the image to a cell of the last feature map."""
@@ -186,6 +185,9 @@ def load_backbone(backbone: ResNet18 | None, path: str | Path) -> None:
         if found[name].shape != wanted[name].shape:
             shapes = f"{tuple(found[name].shape)}, not {tuple(wanted[name].shape)}"
             raise _refusal(path, f"'{name}' is of shape {shapes}")
+        if not found[name].is_floating_point():
+            raise _refusal(path, f"'{name}' is of type {found[name].dtype}")
+    require_finite(found, f"backbone_weights '{path}'")
     backbone.load_state_dict(found)
 
 
@@ -196,12 +198,12 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise RequestError(f"backbone_weights '{path}': there is no such file")
     try:
         if path.suffix == ".safetensors":
-            return load_file(path)
+            return read_tensors(path)[0]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about the age of the file's format
             found = torch.load(path, map_location="cpu", weights_only=True)
-    except SafetensorError as error:
-        raise _refusal(path, f"it is no safetensors file ({error})") from error
+    except RequestError as error:
+        raise _refusal(path, str(error).removeprefix(f"{path}: ")) from error
     except Exception as error:  # unpickling fails in every way there is
         raise _refusal(path, "it holds more than tensors, or is damaged") from error
     if not isinstance(found, dict) or not all(isinstance(v, Tensor) for v in found.values()):

@@ -81,8 +81,8 @@ def test_a_file_that_runs_code_does_not_run_it(tmp_path: Path, monkeypatch: pyte
     [
         ("weights.bin", b"", "must be one of .safetensors, .pth, .pt"),
         ("weights.pth", b"garbage", "holds more than tensors, or is damaged"),
-        ("weights.safetensors", b"garbage" * 9, "it is no safetensors file"),
-        ("weights.safetensors", b"", "it is no safetensors file"),
+        ("weights.safetensors", b"garbage" * 9, "damaged or no safetensors file"),
+        ("weights.safetensors", b"", "damaged or no safetensors file"),
         ("weights.pth", None, "there is no such file"),
     ],
 )

@@ -7,7 +7,6 @@ that a face which looks along world +x has the identity quaternion. Metres, quat
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,12 +15,37 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.npz import ArrayType, FileType, read_npz
 
 Floats = NDArray[np.float64]
 Poses = dict[str, tuple[Floats, Floats]]
 
 SURFACE = Path(__file__).with_name("assets") / "face_surface.npz"
-SCHEMA, VERSION = "face_surface", 1
+
+SURFACE_FILE = FileType(
+    "face_surface",
+    1,
+    {
+        "vertices": ArrayType("f", (468, 3)),
+        "triangles": ArrayType("i", ("M", 3), "not negative"),
+        "jaw_weight": ArrayType("f", (468,), "not negative"),
+        "jaw_hinge": ArrayType("f", (3,)),
+        **{
+            name: ArrayType("i", (size,), "not negative")
+            for name, size in {
+                "lips_outer": 20,
+                "lips_inner": 20,
+                "eye_left": 16,
+                "eye_right": 16,
+                "eyebrow_left": 10,
+                "eyebrow_right": 10,
+            }.items()
+        },
+        "metadata": ArrayType("U", is_optional=True),
+    },
+    limits={"M": 10_000},
+)
+"""Arrays of a surface file."""
 
 REST_OPENING = 0.030
 """Distance between the inner lips, metres, of a person who waits to be fed: the jaw's recorded
@@ -63,23 +87,17 @@ class FaceModel:
             RequestError: the file is absent, damaged or of another schema.
         """
         remedy = "make it with: python -m face_prediction export-surface"
-        try:
-            # opened here: np.load leaves a file that it finds damaged open
-            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-                if str(file["schema"]) != SCHEMA or int(file["version"]) != VERSION:
-                    kind = f"{SCHEMA} file of version {VERSION}"
-                    raise RequestError(f"{path}: not a {kind}; {remedy}")
-                return cls(
-                    vertices=file["vertices"].astype(float)[:, _TO_BODY],
-                    triangles=file["triangles"].astype(np.int32),
-                    jaw_weight=file["jaw_weight"].astype(float),
-                    hinge=file["jaw_hinge"].astype(float)[_TO_BODY],
-                    rings={name: file[name].astype(np.int64) for name in _RINGS},
-                )
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            if isinstance(error, RequestError):
-                raise
-            raise RequestError(f"{path}: cannot be read as a face ({error}); {remedy}") from error
+        arrays = read_npz(path, SURFACE_FILE, remedy=remedy)
+        for name in ("triangles", *_RINGS):
+            if arrays[name].size and arrays[name].max() >= len(arrays["vertices"]):
+                raise RequestError(f"{path}: '{name}' names vertices that do not exist; {remedy}")
+        return cls(
+            vertices=arrays["vertices"].astype(float)[:, _TO_BODY],
+            triangles=arrays["triangles"].astype(np.int32),
+            jaw_weight=arrays["jaw_weight"].astype(float),
+            hinge=arrays["jaw_hinge"].astype(float)[_TO_BODY],
+            rings={name: arrays[name].astype(np.int64) for name in _RINGS},
+        )
 
     @cached_property
     def lips(self) -> NDArray[np.int64]:

@@ -6,11 +6,12 @@ Shapes: N frames of the whole library, R runs, M frames of a segment, H = 5 fram
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from robo_manip_baselines.observation import MAX_HORIZON
 from robo_manip_baselines.observation.corruption import FRAME_RATE
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.npz import (
+    Arrays,
+    ArrayType,
+    FileType,
+    add_array,
+    read_json_array,
+    read_npz,
+)
 
 DEFAULT_LIBRARY = Path(__file__).with_name("assets") / "face_motion.npz"
 
@@ -133,19 +142,7 @@ class MotionLibrary:
             RequestError: the file is missing, damaged or of another schema.
         """
         source = Path(path) if path is not None else DEFAULT_LIBRARY
-        remedy = "make one with 'python -m face_prediction export-motion' or leave the option out"
-        if not source.is_file():
-            raise RequestError(f"motion library '{source}' does not exist; {remedy}")
-        try:
-            with source.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-                content = {key: archive[key] for key in archive.files}
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            problem = f"motion library '{source}' cannot be read ({reason})"
-            raise RequestError(f"{problem}; {remedy}") from error
-        problem = find_problem(content)
-        if problem:
-            raise RequestError(f"motion library '{source}' is damaged: {problem}; {remedy}")
+        content = read_library(source)
         return cls(
             fps=float(content["fps"]),
             mouth=content["mouth"].astype(np.float64),
@@ -155,10 +152,34 @@ class MotionLibrary:
             run_length=content["run_length"].astype(np.int64),
             run_clip=tuple(str(clip) for clip in content["run_clip"]),
             run_subject=tuple(str(subject) for subject in content["run_subject"]),
-            metadata=json.loads(str(content["metadata"])),
+            metadata=read_json_array(content, "metadata", source),
             source=source,
             predicted=content[PREDICTION].astype(np.float64) if PREDICTION in content else None,
         )
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of the motion, whatever file it came from; 64 hexadecimal digits."""
+        digest = hashlib.sha256()
+        for name in ("mouth", "orientation", "jaw", "run_start", "run_length", "predicted"):
+            if (array := getattr(self, name)) is not None:
+                add_array(digest, name, array)
+        names = {"fps": self.fps, "clips": self.run_clip, "subjects": self.run_subject}
+        digest.update(json.dumps(names).encode())
+        return digest.hexdigest()
+
+    def require(self, sha256: str | None) -> None:
+        """Require that this is the library of a digest, if one is given.
+
+        Raises:
+            RequestError: it is another one.
+        """
+        if sha256 not in (None, self.sha256):
+            raise RequestError(
+                f"motion library '{self.source}' holds other motion than what was used before "
+                f"(SHA-256 {self.sha256[:12]}, not {sha256[:12]}); give the file that was used as "
+                "motion_library"
+            )
 
     def starts(self) -> NDArray[np.int64]:
         """Return, (R,), how many frames of each run can start a segment of `SEGMENT_DURATION`."""
@@ -213,72 +234,74 @@ class MotionLibrary:
         )
 
 
-SCHEMA = "recorded_face_motion"
-VERSION = 1
-
-_ARRAYS = {
-    "time": (1, "f"),
-    "mouth": (2, "f"),
-    "orientation": (2, "f"),
-    "jaw": (1, "f"),
-    "run_start": (1, "i"),
-    "run_length": (1, "i"),
-    "run_clip": (1, "U"),
-    "run_subject": (1, "U"),
-}
-
 PREDICTION = "predicted_mouth"
 """(N, H, 3), the one array that a library may lack."""
 
-
-def find_problem(content: dict[str, NDArray[Any]]) -> str | None:
-    """Return what is wrong with the arrays of a library file, or None."""
-    if str(content.get("schema")) != SCHEMA:
-        return f"schema is '{content.get('schema')}', not '{SCHEMA}'"
-    if str(content.get("version")) != str(VERSION):
-        return f"version is {content.get('version')}, this release reads {VERSION}"
-    fps = content.get("fps", np.array(0.0))
-    if fps.shape or fps.dtype.kind not in "fi" or not 0.0 < float(fps) < np.inf:
-        return "'fps' must be one positive number"
-    try:
-        json.loads(str(content["metadata"]))
-    except (KeyError, ValueError):
-        return "'metadata' is missing or not JSON"
-    for name, (ndim, kind) in _ARRAYS.items():
-        if name not in content:
-            return f"'{name}' is missing"
-        if content[name].ndim != ndim or content[name].dtype.kind != kind:
-            return f"'{name}' has shape {content[name].shape} and type {content[name].dtype}"
-        if kind == "f" and not np.isfinite(content[name]).all():
-            return f"'{name}' holds values that are not finite"
-    frames = len(content["time"])
-    if content["mouth"].shape != (frames, 3) or content["orientation"].shape != (frames, 4):
-        return "'mouth' and 'orientation' must have a row per frame, of 3 and 4 numbers"
-    if len(content["jaw"]) != frames:
-        return "'jaw' must have a number per frame"
-    if problem := _prediction_problem(content, frames):
-        return problem
-    if not np.allclose(np.linalg.norm(content["orientation"], axis=1), 1.0, atol=1e-3):
-        return "'orientation' holds quaternions that are not of unit length"
-    start, length = content["run_start"], content["run_length"]
-    counts = {len(content[name]) for name in ("run_start", "run_length", "run_clip", "run_subject")}
-    if len(counts) != 1:
-        return "the run_* arrays differ in length"
-    if (start < 0).any() or (length < 1).any() or (start + length > frames).any():
-        return "a run lies outside the frames"
-    return None
+LIBRARY_FILE = FileType(
+    "recorded_face_motion",
+    1,
+    {
+        "fps": ArrayType("f", (), "positive"),
+        "time": ArrayType("f", ("N",)),
+        "mouth": ArrayType("f", ("N", 3)),
+        "orientation": ArrayType("f", ("N", 4), "quaternion"),
+        "jaw": ArrayType("f", ("N",), "not negative"),
+        "run_start": ArrayType("iu", ("R",), "not negative"),
+        "run_length": ArrayType("iu", ("R",), "positive"),
+        "run_clip": ArrayType("U", ("R",)),
+        "run_subject": ArrayType("U", ("R",)),
+        PREDICTION: ArrayType("f", ("N", MAX_HORIZON, 3), is_optional=True),
+        "metadata": ArrayType("U"),
+    },
+    # A day at 30 frames a second, in runs of a second.
+    limits={"N": 2_592_000, "R": 86_400},
+    quaternion_tolerance=1e-3,
+)
+"""Arrays of a library file."""
 
 
-def _prediction_problem(content: dict[str, NDArray[Any]], frames: int) -> str | None:
-    """Return what is wrong with the predictions of a library file, if it has any, or None."""
-    predicted = content.get(PREDICTION)
-    if predicted is None:
-        return None
-    shape = (frames, MAX_HORIZON, 3)
-    if predicted.shape != shape or predicted.dtype.kind != "f":
-        return f"'{PREDICTION}' has shape {predicted.shape} and type {predicted.dtype}, not {shape}"
-    if not np.isfinite(predicted).all():
-        return f"'{PREDICTION}' holds values that are not finite"
-    if float(content["fps"]) != FRAME_RATE:
-        return f"'{PREDICTION}' is of frames at {FRAME_RATE:g} a second, 'fps' is {content['fps']}"
-    return None
+def read_library(path: Path) -> Arrays:
+    """Read and check the arrays of a library file.
+
+    Raises:
+        RequestError: the file is missing, damaged or of another schema.
+    """
+    remedy = "make one with 'python -m face_prediction export-motion' or leave the option out"
+    name = f"motion library '{path}'"
+    if not path.is_file():
+        raise RequestError(f"{name} does not exist; {remedy}")
+    content = read_npz(path, LIBRARY_FILE, name=name, remedy=remedy)
+    if problem := _run_problem(content):
+        raise RequestError(f"{name}: {problem}; {remedy}")
+    read_json_array(content, "metadata", name)
+    return content
+
+
+def _run_problem(content: Arrays) -> str:
+    """Return what is wrong with the runs of a library file, or nothing."""
+    if not len(content["run_start"]):
+        return "it holds no run"
+    start, length = (content[name].astype(np.float64) for name in ("run_start", "run_length"))
+    if (start + length > len(content["time"])).any():  # no overflow in float64
+        return "'run_start' and 'run_length': a run lies outside the frames"
+    for first, number in zip(content["run_start"], content["run_length"], strict=True):
+        if np.any(np.diff(content["time"][int(first) : int(first) + int(number)]) <= 0):
+            return f"'time' does not increase in the run from frame {first} on"
+    fps = float(content["fps"])
+    if PREDICTION in content and fps != FRAME_RATE:
+        return f"'{PREDICTION}' is of frames at {FRAME_RATE:g} a second, 'fps' is {fps}"
+    return ""
+
+
+def pin_library(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arguments of an environment with the digest of the motion library that they name.
+
+    Raises:
+        RequestError: the file cannot be used, or is another one than that of ``motion_sha256``.
+    """
+    pinned = dict(env_kwargs)
+    if path := pinned.get("motion_library"):
+        library = MotionLibrary.load(path)
+        library.require(pinned.get("motion_sha256"))
+        pinned["motion_sha256"] = library.sha256
+    return pinned

@@ -61,6 +61,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         face_motion: start of the recorded motion: ``episode`` or ``after_lift``.
         clips: ids of recorded clips to draw from; all if None.
         motion_library: file of ``face_prediction export-motion``; the shipped one if None.
+        motion_sha256: digest of the library's motion (`MotionLibrary.sha256`); any if None.
         shadows, multisamples: prettier and slower images, for videos.
         render_mode: ``rgb_array`` or ``human`` (MuJoCo's viewer).
 
@@ -95,6 +96,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         face_motion: str = "episode",
         clips: Sequence[str] | None = None,
         motion_library: str | None = None,
+        motion_sha256: str | None = None,
         shadows: bool = False,
         multisamples: int = 0,
         render_mode: str | None = None,
@@ -114,6 +116,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
         self._pipeline = spec.make_pipeline()
         self.library = MotionLibrary.load(motion_library)
+        self.library.require(motion_sha256)
         if spec.corruption.error == "model":
             if not self.task.predicted_field:
                 raise RequestError(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from inspect import signature
 from typing import Any, Literal, Protocol
 
 import gymnasium
@@ -327,6 +328,79 @@ def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """
     register_envs([name])
     return gymnasium.make(task_entry(name).env_id, **kwargs)
+
+
+ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
+    "obs": (str,),
+    "horizon": (int,),
+    "cameras": (list,),
+    "image_size": (list,),
+    "object_pose": (bool,),
+    "arms": (str,),
+    "corruption": (dict, type(None)),
+    "face_motion": (str,),
+    "clips": (list, type(None)),
+    "motion_library": (str, type(None)),
+    "motion_sha256": (str, type(None)),
+    "shadows": (bool,),
+    "multisamples": (int,),
+    "render_mode": (str, type(None)),
+    "error": (str,),  # of older releases; it says what was shown, like `corruption`
+}
+"""Arguments of every environment, as JSON -> types. The same as those of `FaceEnv`, whose module
+imports the simulator."""
+
+
+def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
+    """Return what is wrong with arguments of an environment that were read from a file, or "".
+
+    Args:
+        task: whose environment may have arguments of its own; the common ones are known if None.
+        kwargs: as JSON gives them.
+    """
+    if not isinstance(kwargs, dict):
+        return f"must be an object with names of arguments, not {str(kwargs)[:80]!r}"
+    unknown = sorted(str(name) for name in kwargs if name not in ENV_ARGUMENTS)
+    if unknown and task is not None:
+        known = signature(load_part(task.env)).parameters
+        unknown = [name for name in unknown if name not in known]
+    if unknown:
+        return f"has '{unknown[0][:80]}', which is no argument of the environment"
+    for name, value in kwargs.items():
+        kinds = ENV_ARGUMENTS.get(name, (type(value),))
+        if type(value) not in kinds:  # a bool is no int here
+            return f"has {name} {str(value)[:80]!r}, not of type {kinds[0].__name__}"
+        if isinstance(value, list):
+            kind = int if name == "image_size" else str
+            if not all(type(item) is kind for item in value):
+                return f"has {name} {str(value)[:80]}, not a list of type {kind.__name__}"
+    if len(kwargs.get("image_size", (0, 0))) != 2:
+        return f"has image_size {str(kwargs['image_size'])[:80]}, not height and width"
+    if kwargs.get("render_mode") not in (None, "rgb_array"):
+        return "has a render_mode that opens windows"
+    return ""
+
+
+@cache
+def _shipped_library() -> str:
+    """Digest of the motion library that ships with the package."""
+    from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary  # the simulator, too
+
+    return MotionLibrary.load().sha256
+
+
+def without_library_path(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arguments of an environment that name the motion library by its content alone.
+
+    A path tells nothing where files may be replaced or moved. Without a path, the library is the
+    one that ships with the package. The path stays where older releases recorded no digest.
+    """
+    kwargs = dict(env_kwargs)
+    if kwargs.get("motion_library") and not kwargs.get("motion_sha256"):
+        return kwargs
+    kwargs.pop("motion_library", None)
+    sha256 = kwargs.pop("motion_sha256", None)
+    return kwargs if sha256 in (None, _shipped_library()) else {**kwargs, "motion_sha256": sha256}
 
 
 FACE_FIELDS = (

@@ -127,6 +127,7 @@ class FeedingEnv(FaceEnv):
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
     | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
     None |
+    | ``motion_sha256`` | None | digest of the library's motion; any if None |
     | ``shadows``, ``multisamples`` | False, 0 | prettier and slower images, for videos |
     | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;
     ``"human"``: MuJoCo's viewer |
