@@ -10,7 +10,7 @@ import re
 import struct
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -73,7 +73,7 @@ def container_margins(container: InputContainer, stream: VideoStream) -> Margins
     level = av.logging.get_level()
     av.logging.set_level(av.logging.INFO)  # the description is a message of this level
     try:
-        text = container.dumps_format()
+        text = str(cast("Any", container).dumps_format())  # not in PyAV's stubs
     finally:
         av.logging.set_level(level)
     parts = re.split(r"^  Stream #0:(\d+)", text, flags=re.MULTILINE)
