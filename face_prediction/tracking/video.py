@@ -25,6 +25,9 @@ DECODING = 2
 """Version of what `VideoReader` makes of a file, recorded in tracks. 2: displayed as a player does,
 damaged frames marked."""
 
+LONGEST_PAUSE = 3600.0
+"""Seconds between two frames; more is a damaged time, and would fill a track with empty frames."""
+
 _TIMELESS = frozenset(
     {"cavsvideo", "dirac", "evc", "h261", "h263", "h264", "hevc", "m4v", "mjpeg", "mpegvideo"}
     | {"obu", "rawvideo", "vc1", "vvc"}
@@ -138,6 +141,8 @@ class VideoReader:
             number += 1
             if time is None or time <= last:
                 continue  # of two frames at one instant the first is kept
+            if time - last > LONGEST_PAUSE and count:
+                raise self._wrong(f"its times jump from {last:.2f} s to {time:.2f} s; cut it there")
             last = time
             try:
                 image = display.image(frame)
