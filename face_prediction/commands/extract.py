@@ -101,10 +101,12 @@ def run_extract(options: ExtractOptions) -> int:
 
 
 def summary(track: FaceTrack) -> str:
-    """Frames of a track, how many of them show the face, and how many were damaged."""
+    """Frames of a track, how many of them show the face, and how many could not be used."""
     text = f"{len(track)} frames, face in {100 * float(track.valid.mean()):.1f} %"
-    damaged, decoded = track.source["frames_damaged"], track.source["frames"]
-    return text + (f"; {damaged} of {decoded} decoded frames damaged, not used" if damaged else "")
+    counts = {what: track.source[f"frames_{what}"] for what in ("damaged", "lost")}
+    bad = " and ".join(f"{count} {what}" for what, count in counts.items() if count)
+    decoded = track.source["frames"] + counts["lost"]
+    return text + (f"; {bad} of the video's {decoded} frames left out" if bad else "")
 
 
 def named(what: str, names: Sequence[str]) -> str:

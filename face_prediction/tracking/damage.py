@@ -15,7 +15,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import av
 
+LONGEST_DELAY = 64
+"""Frames that a decoder may hold back, with a margin: H.264 has at most 16."""
+
 _B_IS_NO_REFERENCE = frozenset(("mpeg1video", "mpeg2video", "mpeg4"))
+_ONE_TO_ONE = frozenset(("h264", "hevc", "mpeg1video", "mpeg2video", "mjpeg", "prores", "dnxhd"))
+"""Codecs of which every packet gives a frame."""
 _B_PICTURE = 3  # FFmpeg's AV_PICTURE_TYPE_B
 
 
@@ -33,11 +38,16 @@ class DamageTracker:
     A frame is held back until every frame that was decoded before it and is displayed after it
     (which it may be predicted from) has come out of the decoder: for most videos a handful.
 
+    Args:
+        stream: the stream that is decoded.
+        has_times: its packets have times of presentation.
+
     Attributes:
-        lost: packets that the decoder refused.
+        lost: packets that gave no frame because they are damaged.
     """
 
-    def __init__(self, stream: av.VideoStream) -> None:
+    def __init__(self, stream: av.VideoStream, *, has_times: bool = True) -> None:
+        self._has_times = has_times
         codec = stream.codec_context
         self._codec = codec.name
         self._length_bytes = nal_length_bytes(codec.name, codec.extradata or b"")
@@ -61,14 +71,11 @@ class DamageTracker:
         self._count += 1
 
     def lose(self) -> None:
-        """Note that the decoder refused the packet taken last."""
-        self.lost += 1
-        number = self._count - 1
-        for time, packet in list(self._waiting.items()):
-            if packet.number == number:
-                del self._waiting[time]
-                if packet.is_reference:
-                    self._note(number)
+        """Note that the decoder refused a packet: the one taken last, or one that it held back."""
+        waiting = {packet.number: time for time, packet in self._waiting.items()}
+        number = self._count - 1 if self._codec in _ONE_TO_ONE else min(waiting, default=-1)
+        if number in waiting:
+            self._drop(waiting[number], is_refused=True)
 
     def put(self, frame: av.VideoFrame) -> Iterator[tuple[av.VideoFrame, bool]]:
         """Note a frame that came out of the decoder, and yield those that are ready."""
@@ -82,14 +89,15 @@ class DamageTracker:
             if packet.is_reference and not is_b:
                 self._note(packet.number)
         self._held.append((frame, packet.number, frame.is_corrupt))
-        if time is not None:  # a packet that should have come out before never will
-            for late in [t for t in self._waiting if t < time]:
-                del self._waiting[late]
+        for at, other in list(self._waiting.items()):
+            if self._is_over(other, at, packet, time):
+                self._drop(at)
         yield from self._ready()
 
     def rest(self) -> Iterator[tuple[av.VideoFrame, bool]]:
         """Yield the frames still held, when there are no more packets."""
-        self._waiting.clear()
+        for time in list(self._waiting):
+            self._drop(time)
         yield from self._ready()
 
     def _ready(self) -> Iterator[tuple[av.VideoFrame, bool]]:
@@ -99,6 +107,30 @@ class DamageTracker:
                 return
             self._held.popleft()
             yield frame, is_damaged or self._is_reached(number, frame.pts)
+
+    def _is_over(self, other: _Packet, at: int, packet: _Packet, time: int | None) -> bool:
+        """Return True if ``other``, due at ``at``, will give no frame once ``packet`` has."""
+        if self._has_times and time is not None:
+            return at < time
+        return other.number < packet.number - LONGEST_DELAY
+
+    def _drop(self, time: int, *, is_refused: bool = False) -> None:
+        """Note that the packet due at ``time`` gave no frame.
+
+        For some codecs that is no sign of damage. Nor is it for frames that are displayed before
+        their key frame: a decoder that begins there leaves them out, and none is predicted from
+        them.
+        """
+        packet = self._waiting.pop(time)
+        _, key_time = self._key_before(packet.number)
+        if is_refused or (self._codec in _ONE_TO_ONE and time >= key_time):
+            self.lost += 1
+            if packet.is_reference:
+                self._note(packet.number)
+
+    def _key_before(self, number: int) -> tuple[int, int]:
+        """Number and time of the last key frame decoded by then; 0, 0 if there is none."""
+        return max((key for key in self._keys if key[0] <= number), default=(0, 0))
 
     def _note(self, number: int) -> None:
         place = bisect_left(self._damaged, number)

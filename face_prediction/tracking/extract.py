@@ -459,6 +459,7 @@ def extract_track(
         "decoding": DECODING,
         "frames": frames,
         "frames_damaged": damaged,
+        "frames_lost": video.lost_frames,
         "frames_with_face": with_face,
         "frames_with_several_faces": several,
         "reacquired": follower.reacquired,

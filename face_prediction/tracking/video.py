@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -75,6 +76,7 @@ class VideoReader:
     Attributes:
         expected_frames: frames by the header; 0 where it does not give them.
         average_rate: frames per second by the header; 0 where it does not give it.
+        lost_frames: frames that could not be decoded, once all have been read.
 
     Raises:
         RequestError: the file is no video, holds no video stream, has been cut off, or is a raw
@@ -105,12 +107,16 @@ class VideoReader:
             stream.thread_type = "SLICE"
             # crop as the codec says to the pixel, not to the alignment of memory
             stream.codec_context.flags |= Flags.unaligned
+            # AVI: numbers of the chunks, which are in decoding order (k-th image: k-th number)
+            is_avi = self._container.format.name == "avi"
+            self._chunk_times: deque[float] | None = deque() if is_avi else None
             self._rate = frame_rate(self._container, stream)
             if self._rate is None and self._container.format.name in _TIMELESS:
-                remedy = "put it into a container that has them (ffmpeg -framerate RATE -i …)"
-                raise self._wrong(f"is a raw stream without times or a frame rate; {remedy}")
+                remedy = "give it one (ffmpeg -framerate RATE -i VIDEO OUT.mp4)"
+                raise self._wrong(f"is a raw stream without times and frame rate; {remedy}")
             self.expected_frames = promised_frames(self._container, stream)
             self.average_rate = float(self._rate or 0.0)
+            self.lost_frames = 0
         except BaseException:
             self._container.close()
             raise
@@ -158,7 +164,8 @@ class VideoReader:
         """Every frame that can be decoded, in display order, and whether it is damaged."""
         from av.error import FFmpegError
 
-        tracker = DamageTracker(self._stream)
+        chunks = self._chunk_times
+        tracker = DamageTracker(self._stream, has_times=chunks is None)
         packets = 0
         is_cut = False  # the packet read last was
         try:
@@ -167,10 +174,14 @@ class VideoReader:
                     packets += 1
                     is_cut = packet.is_corrupt
                     tracker.take(packet)
+                    if chunks is not None and packet.dts is not None:
+                        chunks.append(float(packet.dts * packet.time_base))
                 try:
                     frames = packet.decode()
                 except FFmpegError:
                     tracker.lose()
+                    if chunks:
+                        chunks.pop()
                     continue
                 for frame in cast("list[av.VideoFrame]", frames):
                     yield from tracker.put(frame)
@@ -178,6 +189,7 @@ class VideoReader:
             wrong = f"breaks off after {packets} frames ({error.strerror}); truncated or damaged"
             raise self._wrong(wrong) from None
         yield from tracker.rest()
+        self.lost_frames = tracker.lost
         if is_cut:
             raise self._wrong(f"truncated: breaks off inside the last of its {packets} frames")
         if tracker.lost and self._container.format.name in _TIMELESS:
@@ -190,6 +202,8 @@ class VideoReader:
         """Seconds of a frame, the ``number``-th that was displayed."""
         if frame.time is None and self._rate and self._container.format.name in _TIMELESS:
             return float(number / self._rate)
+        if self._chunk_times:
+            return self._chunk_times.popleft()
         return frame.time
 
 
