@@ -116,7 +116,7 @@ def _end_of_flv(stream: BinaryIO, size: int) -> int:
     place = int.from_bytes(_read(stream, 5, 4), "big") + 4
     while place < size:
         head = _read(stream, place, 4)
-        if len(head) == 4 and head[0] & 0x1F not in (8, 9, 18):  # sound, video, script
+        if head[0] & 0x1F not in (8, 9, 18):  # sound, video, script
             return place
         place += 11 + int.from_bytes(head[1:4], "big") + 4
     return place
@@ -126,7 +126,7 @@ def _end_of_ogg(stream: BinaryIO, size: int) -> int:
     place = 0
     while place < size:
         head = _read(stream, place, 27 + 255)
-        if len(head) >= 4 and head[:4] != b"OggS":
+        if head[:4] != b"OggS"[: len(head)]:
             return place
         segments = head[26] if len(head) > 26 else 0
         place += 27 + segments + sum(head[27 : 27 + segments])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, cast
@@ -35,6 +36,9 @@ _STEREO = {
 _RECTILINEAR = 4
 """Projection of FFmpeg's ``AVSphericalProjection`` that a player shows as it is."""
 _CROPPING = re.compile(r"Frame cropping: (\d+)/(\d+)/(\d+)/(\d+)", re.IGNORECASE)
+
+
+SideData = Mapping[str, bytes]
 
 
 class NotShownError(Exception):
@@ -105,12 +109,13 @@ class Display:
             NotShownError: a player shows something else.
         """
         self._require_unchanged(frame)
-        require_flat(frame)
-        require_colours(frame, self._stream)
+        data = side_data(frame, self._stream)
+        require_flat(frame, data)
+        require_colours(frame, data, self._stream)
         image = self._margins.crop(opaque_rgb(frame))
         # the container's aspect ratio goes before the codec's, as in av_guess_sample_aspect_ratio
         image = with_square_pixels(image, self._stream.sample_aspect_ratio or self._aspect)
-        return np.ascontiguousarray(turned(image, display_matrix(frame)))
+        return np.ascontiguousarray(turned(image, display_matrix(data)))
 
     def _require_unchanged(self, frame: av.VideoFrame) -> None:
         if self.size is None:
@@ -126,23 +131,23 @@ class Display:
         return self._stream.codec_context.sample_aspect_ratio or Fraction(1)
 
 
-def require_flat(frame: av.VideoFrame) -> None:
+def require_flat(frame: av.VideoFrame, data: SideData) -> None:
     """Raise NotShownError if ``frame`` holds two views, a sphere, or two half-images."""
     if frame.interlaced_frame:
         raise NotShownError(
             "its frames are interlaced (two half-images each); deinterlace it first "
             "(ffmpeg -i VIDEO -vf bwdif OUT.mp4)"
         )
-    if (data := _side_data(frame, "STEREO3D")) and (packing := _STEREO.get(_first_int(data))):
+    if "STEREO3D" in data and (packing := _STEREO.get(_first_int(data["STEREO3D"]))):
         raise NotShownError(f"it is a stereoscopic video ({packing}); cut one view out of it")
-    if (data := _side_data(frame, "SPHERICAL")) and _first_int(data) != _RECTILINEAR:
+    if "SPHERICAL" in data and _first_int(data["SPHERICAL"]) != _RECTILINEAR:
         raise NotShownError("it is a spherical video; render a flat view of it first")
 
 
-def require_colours(frame: av.VideoFrame, stream: VideoStream) -> None:
+def require_colours(frame: av.VideoFrame, data: SideData, stream: VideoStream) -> None:
     """Raise NotShownError if colours of ``frame`` need a conversion that swscale does not have."""
     transfer = _HDR_TRANSFERS.get(int(stream.codec_context.color_trc))
-    if transfer is None and _side_data(frame, "DOVI_METADATA"):
+    if transfer is None and "DOVI_METADATA" in data:
         transfer = "Dolby Vision"
     if transfer:
         raise NotShownError(f"its colours are high dynamic range ({transfer}); tone-map it first")
@@ -185,17 +190,15 @@ def with_square_pixels(image: np.ndarray, aspect: Fraction) -> np.ndarray:
     return np.asarray(cv2.resize(np.ascontiguousarray(image), size), dtype=np.uint8)
 
 
-def display_matrix(frame: av.VideoFrame) -> np.ndarray:
-    """Signed permutation (2, 2) that carries (x right, y down) of ``frame`` to the screen's.
+def display_matrix(data: SideData) -> np.ndarray:
+    """Signed permutation (2, 2) that carries (x right, y down) of a frame to the screen's.
 
     Raises:
-        NotShownError: the frame's display matrix turns by no multiple of 90 degrees, shears, or
-            stretches.
+        NotShownError: the display matrix turns by no multiple of 90 degrees, shears, or stretches.
     """
-    data = _side_data(frame, "DISPLAYMATRIX")
-    if data is None:
+    if "DISPLAYMATRIX" not in data:
         return np.eye(2, dtype=int)
-    a, b, u, c, d, v, _, _, w = struct.unpack("=9i", data[:36])
+    a, b, u, c, d, v, _, _, w = struct.unpack("=9i", data["DISPLAYMATRIX"][:36])
     matrix = np.array([[a, c], [b, d]], dtype=float)
     scale = np.abs(matrix).max()
     # entries are 16.16 fixed point: cosines of 90 degrees round to 0 within a part or two
@@ -220,13 +223,35 @@ def turned(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return image[:: int(y), :: int(x)]
 
 
-def _side_data(frame: av.VideoFrame, name: str) -> bytes | None:
-    """The frame's first side data of this type, as FFmpeg's players take it."""
-    data: Any  # PyAV's stubs call its elements keys
-    for data in frame.side_data:
-        if data.type.name == name:
-            return bytes(data)
-    return None
+def side_data(frame: av.VideoFrame, stream: VideoStream) -> SideData:
+    """Side data of ``frame`` by the name of their type; the first of each, as players take it."""
+    unknown: list[str] = []
+    while True:
+        try:
+            listed: list[Any] = [*frame.side_data]  # PyAV's stubs call its elements keys
+            break
+        except ValueError as error:
+            # PyAV lists none where it has no name for one, such as EXIF: without that one it does
+            found = re.match(r"\d+", str(error))
+            if found is None or found.group() in unknown:
+                raise NotShownError(f"its side data cannot be read ({error})") from None
+            unknown.append(found.group())
+            frame = _without_side_data(frame, stream, unknown[-1])
+    return {data.type.name: bytes(data) for data in reversed(listed)}
+
+
+def _without_side_data(frame: av.VideoFrame, stream: VideoStream, kind: str) -> av.VideoFrame:
+    """``frame`` without its side data of one type, a number of FFmpeg."""
+    from av.filter import Graph
+
+    graph = Graph()
+    source, sink = graph.add_buffer(template=stream), graph.add("buffersink")
+    removal = graph.add("sidedata", f"mode=delete:type={kind}")
+    source.link_to(removal)
+    removal.link_to(sink)
+    graph.configure()
+    graph.push(frame)
+    return cast("av.VideoFrame", graph.pull())
 
 
 def _first_int(data: bytes) -> int:

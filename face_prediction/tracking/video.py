@@ -29,6 +29,10 @@ damaged frames marked."""
 LONGEST_PAUSE = 3600.0
 """Seconds between two frames; more is a damaged time, and would fill a track with empty frames."""
 
+MOST_BEHIND = 3
+"""Frames in a row that are left out because their times go back; more is another clock."""
+REMEDY = "cut it there, or give it other times (ffmpeg -i VIDEO -r RATE OUT.mp4)"
+
 _TIMELESS = frozenset(
     {"cavsvideo", "dirac", "evc", "h261", "h263", "h264", "hevc", "m4v", "mjpeg", "mpegvideo"}
     | {"obu", "rawvideo", "vc1", "vvc"}
@@ -141,14 +145,17 @@ class VideoReader:
                 show it in a way that is not supported here.
         """
         display = Display(self._container, self._stream)
-        last, number, count = -np.inf, 0, 0
+        last, number, count, behind = -np.inf, 0, 0, 0
         for frame, is_damaged in self._decoded():
             time = self._time(frame, number)
             number += 1
+            behind = behind + 1 if time is not None and time < last else 0
+            if behind > MOST_BEHIND:
+                raise self._wrong(f"its times go back from {last:.2f} s to {time:.2f} s; {REMEDY}")
             if time is None or time <= last:
                 continue  # of two frames at one instant the first is kept
             if time - last > LONGEST_PAUSE and count:
-                raise self._wrong(f"its times jump from {last:.2f} s to {time:.2f} s; cut it there")
+                raise self._wrong(f"its times jump from {last:.2f} s to {time:.2f} s; {REMEDY}")
             last = time
             try:
                 image = display.image(frame)
@@ -159,6 +166,10 @@ class VideoReader:
         if count == 0:
             wrong = f"none of its {number} frames has a time" if number else "holds no frame"
             raise self._wrong(f"{wrong} that can be used; truncated, damaged, or not a video")
+        if number > 2 * count:
+            raise self._wrong(
+                f"only {count} of its {number} frames have times of their own; {REMEDY}"
+            )
 
     def _decoded(self) -> Iterator[tuple[av.VideoFrame, bool]]:
         """Every frame that can be decoded, in display order, and whether it is damaged."""

@@ -64,8 +64,9 @@ SAVED_AS = {
     "everything quoted": "\n".join(
         ",".join(f'"{cell}"' for cell in line.split(",")) for line in CSV.splitlines()[::2]
     ).encode() + b'\n"a.mp4","ann","yes","MIT","someone/somewhere","nods; talks"',
-    "quoted and with semicolons": b'"clip";"subject";"ship";"licence";"source"\n"a.mp4";"ann";"yes";'
-    b'"MIT";"someone/somewhere"\n"b";"bob";"no";"unknown; perhaps";"elsewhere"',
+    "quoted and with semicolons": b'"clip";"subject";"ship";"licence";"source"\n'
+    b'"a.mp4";"ann";"yes";"MIT";"someone/somewhere"\n'
+    b'"b";"bob";"no";"unknown; perhaps";"elsewhere"',
     "empty rows and cells": CSV.replace("elsewhere,", "elsewhere,,,,").encode() + b",,,,,\n\n,,\n",
     "other letter case": CSV.replace("clip,subject,ship", "Clip,SUBJECT,Ship")
     .replace("yes", "Yes").replace("no,", "NO,").encode(),
