@@ -31,7 +31,8 @@ from face_prediction.dataset.manifest import (
 )
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings, kind_of
-from face_prediction.motion.library import Attribution, read_attributions, track_files
+from face_prediction.motion.attribution import Attribution, find_row, read_attributions
+from face_prediction.motion.library import track_files
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import require_out_folder
 
@@ -129,12 +130,13 @@ def read_rows(tracks: Iterable[Path], table: Path | None) -> dict[str, Attributi
     """
     known = {} if table is None else read_attributions(table)
     clips = [path.stem for path in tracks]
-    unknown = [clip for clip in clips if clip not in known]
+    found = {clip: find_row(known, clip) for clip in clips}
+    unknown = [clip for clip, row in found.items() if row is None]
     if unknown:
         names = ", ".join(unknown[:3] + ["..."] * (len(unknown) > 3))
         what = "%d clips have no row in --attribution (%s): each counts as a person of its own"
         logger.warning(what, len(unknown), names)
-    return {clip: known.get(clip, Attribution(clip, clip, False)) for clip in clips}
+    return {clip: row or Attribution(clip, clip, False) for clip, row in found.items()}
 
 
 def refuse_same_video(entries: Iterable[ClipEntry]) -> None:

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from face_prediction.motion.library import Attribution, attributed_tracks
+from face_prediction.motion.attribution import Attribution
+from face_prediction.motion.library import attributed_tracks
 from face_prediction.motion.surface import facing_out, measure, mediapipe_topology, metric_landmarks
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError

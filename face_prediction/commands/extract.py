@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,12 +13,15 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.tracking.detector import FaceDetector, find_model
 from face_prediction.tracking.extract import ExtractSettings, extract_track, is_track_up_to_date
-from face_prediction.tracking.tracks import save_track
+from face_prediction.tracking.tracks import FaceTrack, save_track
 from face_prediction.tracking.video import require_video
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest, require_out_folder
 
 logger = logging.getLogger(__name__)
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ENOMEM)
+"""Errors that the next video would meet, too."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +53,18 @@ def run_extract(options: ExtractOptions) -> int:
     """Extract every video; one that cannot be used is named and the others go on.
 
     Returns:
-        0, or 2 when some video could not be used.
+        0; 2 when some video could not be used; 1 when the program failed on one.
 
     Raises:
         RequestError: nothing could be started.
+        OSError: there is no room to write tracks.
     """
     settings = options.settings
     outputs = output_paths(options.videos, options.out)
     model = find_model(options.model)
-    made = kept = refused = 0
+    made = kept = 0
+    refused: list[str] = []
+    failed: list[str] = []
     for number, (video, out) in enumerate(outputs, start=1):
         prefix = f"[{number}/{len(outputs)}] "
         try:
@@ -74,15 +81,37 @@ def run_extract(options: ExtractOptions) -> int:
         except RequestError as error:
             if len(outputs) == 1:
                 raise
-            refused += 1
+            refused.append(video.name)
             logger.error("%s%s", prefix, error)
             continue
+        except Exception as error:
+            if len(outputs) == 1 or getattr(error, "errno", None) in NO_ROOM:
+                raise
+            failed.append(video.name)
+            logger.error("%s%s: %s: %s", prefix, video, type(error).__name__, error)
+            logger.debug("", exc_info=True)
+            continue
         made += 1
-        share = 100 * float(track.valid.mean())
-        logger.info("%s%s: %d frames, face in %.1f %%", prefix, out, len(track), share)
+        logger.info("%s%s: %s", prefix, out, summary(track))
     if len(outputs) > 1:
-        logger.info("%d made, %d already up to date, %d refused", made, kept, refused)
-    return 2 if refused else 0
+        counts = [f"{made} made", f"{kept} already up to date", named("refused", refused)]
+        counts += [named("failed", failed)] if failed else []
+        logger.info("%s", ", ".join(counts))
+    return 1 if failed else 2 if refused else 0
+
+
+def summary(track: FaceTrack) -> str:
+    """Frames of a track, how many of them show the face, and how many could not be used."""
+    text = f"{len(track)} frames, face in {100 * float(track.valid.mean()):.1f} %"
+    counts = {what: track.source[f"frames_{what}"] for what in ("damaged", "lost")}
+    bad = " and ".join(f"{count} {what}" for what, count in counts.items() if count)
+    decoded = track.source["frames"] + counts["lost"]
+    return text + (f"; {bad} of the video's {decoded} frames left out" if bad else "")
+
+
+def named(what: str, names: Sequence[str]) -> str:
+    """Count and names of the videos with one result."""
+    return f"{len(names)} {what}" + (f" ({', '.join(names)})" if names else "")
 
 
 def output_paths(videos: Iterable[Path], out: Path) -> list[tuple[Path, Path]]:

@@ -25,6 +25,8 @@ from robo_manip_baselines.runs.files import require_out_file
 
 logger = logging.getLogger(__name__)
 
+MAX_CAMERAS = 100
+"""OpenCV reads hundreds as the name of a driver, and crashes at numbers below 0."""
 HORIZON = 5
 """Frames ahead (paper, IV.A)."""
 SHIPPED = "shipped"
@@ -72,7 +74,7 @@ def run_live(options: LiveOptions) -> int:
     """
     check_live_options(options)
     name, forecaster, settings = load_forecaster(options.checkpoint, options.dataset)
-    model = find_model(options.detector_model)
+    model = find_model(options.detector_model, option="--detector_model")
     rate = settings.fps
     if options.video is not None:
         with VideoReader(options.video) as reader:
@@ -105,6 +107,8 @@ def check_live_options(options: LiveOptions) -> None:
     out, video = options.out, options.video
     if (options.camera is None) == (video is None):
         raise RequestError("give either --camera NUMBER or --video FILE")
+    if options.camera is not None and not 0 <= options.camera < MAX_CAMERAS:
+        raise RequestError(f"--camera {options.camera}: valid: 0 to {MAX_CAMERAS - 1}")
     if options.seconds is not None and not options.seconds > 0:
         raise RequestError(f"--seconds {options.seconds}: must be positive")
     if video is not None:

@@ -29,7 +29,7 @@ from face_prediction.dataset.sequences import (
     find_sequences,
     sequence_statistics,
 )
-from face_prediction.motion.library import Attribution
+from face_prediction.motion.attribution import Attribution
 from face_prediction.motion.report import markdown_table
 from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import VideoReader, with_bar

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from face_prediction.motion.library import Attribution
+from face_prediction.motion.attribution import Attribution
 from face_prediction.motion.motion import Quality, QualityLimits, assess
 from face_prediction.tracking.extract import SAME_TIME, Samples, resample
 from face_prediction.tracking.geometry import LIPS, Crop, crop_around, lift_landmarks

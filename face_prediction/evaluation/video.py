@@ -62,14 +62,15 @@ def h264_file(
         rate: images a second; if the file is timed, about how many.
         preset: of libx264.
         threads: of the encoder; with 1 the same images give the same bytes on every machine.
-        is_timed: every image has its own time, whatever the rate.
+        is_timed: every image has its own time, whatever the rate. Where the first time is below
+            0, which a file cannot hold, all are later by as much.
 
     Raises:
         RequestError: the folder cannot be written to, or there was no image.
     """
     import av  # not needed to make tables
 
-    count = last_tick = 0
+    count = last_tick = begin = 0
     with (
         atomic_file(path) as temporary,
         # the index goes to the front, so that a browser starts to play before all has arrived
@@ -83,14 +84,16 @@ def h264_file(
             stream.codec_context.time_base = Fraction(1, _CLOCK)
 
         def append(image: Image, time: float = 0.0) -> None:
-            nonlocal count, last_tick
+            nonlocal count, last_tick, begin
             height, width = (side // 2 * 2 for side in image.shape[:2])
             if not count:
                 stream.height, stream.width = height, width
             pixels = np.ascontiguousarray(image[:height, :width])
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             if is_timed:
-                last_tick = max(round(time * _CLOCK), last_tick + 1 if count else 0)
+                tick = round(time * _CLOCK)
+                begin = begin if count else min(tick, 0)
+                last_tick = max(tick - begin, last_tick + 1 if count else 0)
                 frame.time_base, frame.pts = Fraction(1, _CLOCK), last_tick
             container.mux(stream.encode(frame))
             count += 1

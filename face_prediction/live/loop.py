@@ -87,7 +87,7 @@ def run_loop(
     last = None
     for frame in frames:
         begun = clock()
-        landmarks = find(frame.image, frame.time)
+        landmarks = None if frame.is_damaged else find(frame.image, frame.time)
         found = clock()
         forecast = predictor.update(frame.time, landmarks, frame.image)
         done = clock()

@@ -1,22 +1,19 @@
 """The library of recorded face motion: clips that may be redistributed, their runs, and its file.
 
-Attribution tables tell who is in a clip, where it is from, and whether numbers measured on it may
-be redistributed.
-
 Legend: N frames, R runs, H horizon.
 """
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from face_prediction.motion.attribution import Attribution, find_row, read_attributions
 from face_prediction.motion.motion import (
     ClipMotion,
     MotionSettings,
@@ -32,9 +29,6 @@ from robo_manip_baselines.runs.npz import ArrayType, FileType, read_json_array, 
 
 SCHEMA = "recorded_face_motion"
 VERSION = 1
-
-COLUMNS = ("clip", "subject", "ship", "licence", "source")
-"""Columns of an attribution table."""
 
 CAMERA_MODEL = (
     f"pinhole, {VERTICAL_FOV_DEGREES:g} degrees vertical field of view (assumed), principal point "
@@ -70,92 +64,6 @@ LIBRARY_FILE = FileType(
     limits={"N": 2_592_000, "R": 86_400, "H": 300},
 )
 """Arrays of a library file; robo_manip_baselines reads the same file for its environments."""
-
-
-@dataclass(frozen=True)
-class Attribution:
-    """Row of one clip.
-
-    Attributes:
-        clip: name without suffix.
-        subject: the person.
-        ship: numbers measured on the clip may be redistributed.
-        licence: terms of use.
-        source: origin.
-        kind: kind of footage, from the optional column ``kind``.
-        what: content, from the optional column ``what``.
-    """
-
-    clip: str
-    subject: str
-    ship: bool
-    licence: str = "not stated"
-    source: str = "not stated"
-    kind: str = ""
-    what: str = ""
-
-    def record(self) -> dict[str, str]:
-        """Subject, licence and source, which a library keeps."""
-        return {"subject": self.subject, "licence": self.licence, "source": self.source}
-
-
-def read_attributions(path: Path) -> dict[str, Attribution]:
-    """Rows of a table with the columns clip, subject, ship (yes or no), licence and source.
-
-    Columns ``kind`` and ``what`` are read where there are any. The file is a ``.csv`` with a header
-    line, or a Markdown file with such a table in it; other columns, text and tables are passed
-    over.
-
-    Raises:
-        RequestError: the file cannot be read, has no such table, or a row is incomplete.
-    """
-
-    def wrong(problem: str) -> RequestError:
-        return RequestError(f"--attribution {path}: {problem}")
-
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise wrong(f"cannot be read ({error})") from None
-    rows = csv.reader(lines) if path.suffix == ".csv" else _markdown_rows(lines)
-    header: list[str] | None = None
-    is_found = False
-    attributions: dict[str, Attribution] = {}
-    for cells in rows:
-        if cells is None:
-            header = None
-        elif set(COLUMNS) <= {cell.lower() for cell in cells}:
-            header, is_found = [cell.lower() for cell in cells], True
-        elif header is None or not cells:
-            continue
-        elif len(cells) != len(header):
-            raise wrong(f"{len(cells)} cells for {len(header)} columns in the row of '{cells[0]}'")
-        else:
-            row = dict(zip(header, cells, strict=True))
-            if missing := [name for name in COLUMNS if not row[name]]:
-                raise wrong(f"row '{row['clip']}' has no {', '.join(missing)}")
-            ship = row["ship"].lower()
-            if ship not in ("yes", "no"):
-                raise wrong(f"ship '{row['ship']}' in the row of '{row['clip']}'; yes or no")
-            clip = Path(row["clip"]).stem
-            if clip in attributions:
-                raise wrong(f"two rows for '{clip}'")
-            kept = {name: row.get(name, "") for name in (*COLUMNS[3:], "kind", "what")}
-            attributions[clip] = Attribution(clip, row["subject"], ship == "yes", **kept)
-    if not is_found:
-        raise wrong(f"no table with the columns {', '.join(COLUMNS)} in it")
-    return attributions
-
-
-def _markdown_rows(lines: Iterable[str]) -> Iterator[list[str] | None]:
-    """Cells of the lines of tables, without the rules below their headers; None for other text."""
-    for line in lines:
-        text = line.strip()
-        cells = [cell.strip() for cell in text.strip("|").split("|")]
-        if not text.startswith("|"):
-            yield None
-        elif not set("".join(cells)) <= set("-: "):
-            yield cells
 
 
 def track_files(given: Iterable[Path]) -> list[Path]:
@@ -195,10 +103,14 @@ def attributed_tracks(tracks: Iterable[Path], table: Path | None) -> list[tuple[
     if table is None:
         return [(path, Attribution(path.stem, path.stem, True)) for path in track_files(tracks)]
     rows, paths = read_attributions(table), track_files(tracks)
+    found: list[tuple[Path, Attribution]] = []
     for path in paths:
-        if (clip := path.stem) not in rows:
-            raise RequestError(f"{path}: no row for '{clip}' in {table}; add one (ship yes or no)")
-    return [(path, rows[path.stem]) for path in paths]
+        row = find_row(rows, path.stem)
+        if row is None:
+            missing = f"no row for '{path.stem}' in {table}; add one (ship yes or no)"
+            raise RequestError(f"{path}: {missing}")
+        found.append((path, row))
+    return found
 
 
 def refuse_other_files(out: Path) -> None:
@@ -234,9 +146,12 @@ def lift_clips(
     """Lift the clips that may ship (of the names ``only``, if given), and count those that may not.
 
     Raises:
-        RequestError: a track has no row or cannot be used.
+        RequestError: a track has no row or cannot be used, or no clip may ship.
     """
     rows = attributed_tracks(tracks, table)
+    if not any(row.ship for _, row in rows):
+        none = f"none of the {len(rows)} clips given has ship=yes; nothing may be redistributed"
+        raise RequestError(f"--attribution {table}: {none}")
     clips: list[LiftedClip] = []
     for path, row in rows:
         if row.ship and (only is None or row.clip in only):

@@ -41,8 +41,15 @@ def default_model_path() -> Path:
     return Path(cache) / "face_prediction" / MODEL_NAME
 
 
-def find_model(given: Path | None, url: str = MODEL_URL, expected: str = MODEL_SHA256) -> Path:
+def find_model(
+    given: Path | None,
+    url: str = MODEL_URL,
+    expected: str = MODEL_SHA256,
+    option: str = "--model",
+) -> Path:
     """The model to use: ``given`` if named, else the cached one, downloaded once if absent.
+
+    ``option`` is the one that names a model in the command that asks.
 
     Raises:
         RequestError: the named file is absent, or the cached one is damaged or absent and cannot
@@ -50,7 +57,7 @@ def find_model(given: Path | None, url: str = MODEL_URL, expected: str = MODEL_S
     """
     if given is not None:
         if not given.is_file():
-            raise RequestError(f"--model {given}: no such file; download it from {MODEL_URL}")
+            raise RequestError(f"{option} {given}: no such file; download it from {MODEL_URL}")
         return given
     path = default_model_path()
     if path.is_file():
@@ -66,7 +73,7 @@ def find_model(given: Path | None, url: str = MODEL_URL, expected: str = MODEL_S
     except OSError as error:  # URLError is one
         raise RequestError(
             f"no model at {path} and none could be downloaded ({getattr(error, 'reason', error)}); "
-            f"on a machine with a network fetch {url}, then put it there or name it with --model"
+            f"on a machine with a network fetch {url}, then put it there or name it with {option}"
         ) from None
     found = hashlib.sha256(data).hexdigest()
     if found != expected:
@@ -76,7 +83,7 @@ def find_model(given: Path | None, url: str = MODEL_URL, expected: str = MODEL_S
             temporary.write_bytes(data)
     except (OSError, RequestError) as error:
         raise RequestError(
-            f"{path}: cannot be written ({error}); name a model with --model"
+            f"{path}: cannot be written ({error}); name a model with {option}"
         ) from None
     return path
 
@@ -162,6 +169,8 @@ class FaceDetector:
                 f"{model}: MediaPipe cannot load it as a face landmarker model ({first_line})"
             ) from None
         self._warm = False
+        self._begun: float | None = None  # s of the first image in video mode
+        self._clock = -1  # ms of the last one
 
     def __enter__(self) -> FaceDetector:
         return self
@@ -183,7 +192,10 @@ class FaceDetector:
         # the inference threads announce themselves on the first image
         with contextlib.nullcontext() if self._warm else native_stderr_silenced():
             if self._follows:
-                result = self._landmarker.detect_for_video(mp_image, round(time * 1000))
+                # MediaPipe's clock counts milliseconds from 0, and no two images may share one
+                self._begun = time if self._begun is None else self._begun
+                self._clock = max(round((time - min(self._begun, 0.0)) * 1000), self._clock + 1)
+                result = self._landmarker.detect_for_video(mp_image, self._clock)
             else:
                 result = self._landmarker.detect(mp_image)
         self._warm = True

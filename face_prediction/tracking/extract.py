@@ -28,7 +28,7 @@ from face_prediction.tracking.geometry import (
     slerp,
 )
 from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, Size, load_track
-from face_prediction.tracking.video import VideoReader, with_bar
+from face_prediction.tracking.video import DECODING, VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
 
@@ -40,6 +40,9 @@ speed (1-4 cm/s) has gone 4 mm, in an unknown direction."""
 SAME_TIME = 1e-3
 """A frame nearer than this to a decoded one is that frame (video clocks tick in 1/90000 s or
 more)."""
+
+CHUNK = 256
+"""Decoded frames whose detections are held before they are resampled."""
 
 SMALL_FACE = 0.2
 """Faces narrower than this share of the frame's longer side are detected through a window."""
@@ -100,20 +103,62 @@ class Samples:
     head_pose: np.ndarray
     valid: np.ndarray
 
+    def after(self, earlier: Samples) -> Samples:
+        """These samples after ``earlier`` ones."""
+        pairs = zip(vars(earlier).values(), vars(self).values(), strict=True)
+        return Samples(*(np.concatenate(pair) for pair in pairs))
 
-def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Samples, np.ndarray]:
-    """Detections every 1/fps seconds from the first source time to the last.
+    def tail(self, count: int) -> Samples:
+        """The last ``count`` samples."""
+        return Samples(*(array[-count:].copy() for array in vars(self).values()))
+
+
+class Resampler:
+    """Detections every 1/fps seconds from the first source time to the last, chunk by chunk.
 
     A frame that falls between two decoded frames is interpolated (landmarks and position linearly,
     rotation along the arc) when both are valid and no more than ``max_gap`` seconds apart;
     otherwise it is invalid and NaN.
-
-    Returns:
-        The samples, and ``interpolated`` (T,) bool: which of them lie between two decoded frames.
     """
+
+    def __init__(self, fps: float, max_gap: float = MAX_GAP) -> None:
+        self._fps, self._max_gap = fps, max_gap
+        self._begin: float | None = None
+        self._count = 0  # samples made
+        self._kept: Samples | None = None  # last two detections
+
+    def add(self, source: Samples, *, is_last: bool = False) -> tuple[Samples, np.ndarray]:
+        """Samples that the detections so far determine.
+
+        Args:
+            source: the next detections; at least one in all.
+            is_last: no more will follow.
+
+        Returns:
+            The samples (T, ...), and ``interpolated`` (T,) bool: which of them lie between two
+            decoded frames.
+        """
+        if self._kept is not None:
+            source = source.after(self._kept)
+        times = source.timestamps
+        self._begin = float(times[0]) if self._begin is None else self._begin
+        count = int(np.floor((times[-1] - self._begin) * self._fps + 1e-6)) + 1
+        wanted = self._begin + np.arange(self._count, count) / self._fps
+        if not is_last:  # at the last time and after it, the next detection counts
+            wanted = wanted[wanted < times[-1]]
+        self._count += len(wanted)
+        self._kept = source.tail(2)
+        return _samples_at(wanted, source, self._max_gap)
+
+
+def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Samples, np.ndarray]:
+    """What a `Resampler` makes of ``source``, whole."""
+    return Resampler(fps, max_gap).add(source, is_last=True)
+
+
+def _samples_at(wanted: np.ndarray, source: Samples, max_gap: float) -> tuple[Samples, np.ndarray]:
+    """Samples at the times ``wanted`` (T,), and which of them lie between two decoded frames."""
     times = source.timestamps
-    count = int(np.floor((times[-1] - times[0]) * fps + 1e-6)) + 1
-    wanted = times[0] + np.arange(count) / fps
     after = np.clip(np.searchsorted(times, wanted, side="right"), 1, max(len(times) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(times) - 1)
@@ -283,16 +328,103 @@ class FaceFollower:
         return faces[index]
 
 
+class RowStore:
+    """Rows of one array, appended to contiguous memory that grows in place."""
+
+    def __init__(self, dtype: str, shape: tuple[int, ...] = ()) -> None:
+        self._dtype, self._shape = np.dtype(dtype), shape
+        self._bytes = bytearray()
+
+    def append(self, rows: np.ndarray) -> None:
+        """Append rows (T, *shape), converted to the type of the store."""
+        self._bytes += np.ascontiguousarray(rows, dtype=self._dtype).data.cast("B")
+
+    def array(self) -> np.ndarray:
+        """All rows, without a copy; nothing may be appended afterwards."""
+        return np.frombuffer(self._bytes, dtype=self._dtype).reshape(-1, *self._shape)
+
+
+class TrackBuilder:
+    """Collects the detections of a video, and resamples them `CHUNK` by `CHUNK`.
+
+    Beyond one chunk only what the track will hold is kept, in the track's types.
+
+    Args:
+        fps: frames per second of the track; None keeps the decoded frames.
+        max_gap: as for `resample`.
+    """
+
+    def __init__(self, fps: float | None, max_gap: float) -> None:
+        self._fps = fps
+        self._resampler = None if fps is None else Resampler(fps, max_gap)
+        self._times: list[float] = []  # of this chunk
+        self._faces: list[FaceDetection | None] = []
+        self._size: Size = (0, 0)
+        self._rows = {
+            "landmarks": RowStore("float32", (NUM_LANDMARKS, 3)),
+            "valid": RowStore("bool"),
+            "interpolated": RowStore("bool"),
+            "timestamps": RowStore("float64"),
+            "head_pose": RowStore("float64", (4, 4)),
+            "jaw": RowStore("float32"),
+            "source_timestamps": RowStore("float64"),
+            "source_valid": RowStore("bool"),
+        }
+
+    def add(self, time: float, face: FaceDetection | None, image_size: Size) -> None:
+        """Take in the face of the frame at ``time`` seconds, or None."""
+        if len(self._times) == CHUNK:
+            self._flush(is_last=False)
+        self._times.append(time)
+        self._faces.append(face)
+        self._size = image_size
+
+    def finish(self, source: dict[str, Any], detector: dict[str, Any]) -> FaceTrack:
+        """The track of all frames, at least one."""
+        self._flush(is_last=True)
+        arrays = {name: rows.array() for name, rows in self._rows.items()}
+        times = arrays["source_timestamps"]
+        steps = np.diff(times)
+        # intervals that differ by more than 5 ms; container clocks tick more finely
+        source = {**source, "variable_rate": bool(len(steps) > 1 and np.ptp(steps) > 0.005)}
+        fps = self._fps
+        if fps is None:
+            span = float(times[-1] - times[0])
+            fps = (len(times) - 1) / span if span > 0 else 1.0
+        return FaceTrack(
+            **arrays, image_size=self._size, fps=float(fps), source=source, detector=detector
+        )
+
+    def _flush(self, *, is_last: bool) -> None:
+        nowhere = FaceDetection(np.full((NUM_LANDMARKS, 3), np.nan), np.full((4, 4), np.nan))
+        samples = Samples(
+            timestamps=np.array(self._times),
+            landmarks=np.array([(face or nowhere).landmarks for face in self._faces]),
+            head_pose=np.array([(face or nowhere).head_pose for face in self._faces]),
+            valid=np.array([face is not None for face in self._faces]),
+        )
+        self._times, self._faces = [], []
+        self._rows["source_timestamps"].append(samples.timestamps)
+        self._rows["source_valid"].append(samples.valid)
+        interpolated = np.zeros(len(samples.valid), dtype=bool)
+        if self._resampler is not None:
+            samples, interpolated = self._resampler.add(samples, is_last=is_last)
+        for name, values in vars(samples).items():
+            self._rows[name].append(values)
+        self._rows["interpolated"].append(interpolated)
+        self._rows["jaw"].append(jaw_openings(samples.landmarks, samples.head_pose, self._size))
+
+
 def extract_track(
     path: Path, detector: FaceDetector, settings: ExtractSettings, label: str | None = None
 ) -> FaceTrack:
     """Read the video at ``path`` and follow one face through it.
 
-    ``detector`` has the settings' detector settings; ``label`` is that of a progress bar, None: no
-    bar.
+    Faces are not looked for in damaged frames. ``detector`` has the settings' detector settings;
+    ``label`` is that of a progress bar, None: no bar.
 
     Raises:
-        RequestError: the video cannot be read to its end.
+        RequestError: the video cannot be read to its end, or not as a player shows it.
         NoFaceError: no frame of it shows a face.
     """
     digest = file_digest(path)
@@ -301,67 +433,41 @@ def extract_track(
     if settings.zoom:
         zooming = ZoomingDetector(detect, read_canonical_face(detector.model))
         detect = zooming.detect
-    times: list[float] = []
-    found: list[FaceDetection | None] = []
-    several = 0
-    size = (0, 0)
+    builder = TrackBuilder(settings.fps, settings.max_gap)
+    frames = damaged = with_face = several = 0
     with VideoReader(path) as video:
         for frame in with_bar(video.frames(), video.expected_frames or None, label):
-            height, width = frame.image.shape[:2]
-            if times and (width, height) != size:
-                raise RequestError(f"{path}: its image size changes at {frame.time:.2f} s")
-            size = (width, height)
-            faces = detect(frame.image, frame.time)
-            several += len(faces) > 1
-            times.append(frame.time)
-            face = follower.choose(faces, frame.time, size)
-            if zooming and face is not None:
-                face = zooming.refine(face, frame.image, frame.time)
-            found.append(face)
-    steps = np.diff(times)
+            size = (frame.image.shape[1], frame.image.shape[0])
+            frames += 1
+            face = None
+            if frame.is_damaged:
+                damaged += 1
+            else:
+                faces = detect(frame.image, frame.time)
+                several += len(faces) > 1
+                face = follower.choose(faces, frame.time, size)
+                if zooming and face is not None:
+                    face = zooming.refine(face, frame.image, frame.time)
+            with_face += face is not None
+            builder.add(frame.time, face, size)
+    if with_face == 0:
+        of_them = f", {damaged} of which are damaged" if damaged else ""
+        raise NoFaceError(f"{path}: no face found in any of its {frames} frames{of_them}")
     source = {
         "name": path.name,
         "sha256": digest,
-        "frames": len(times),
-        "frames_with_face": sum(face is not None for face in found),
+        "decoding": DECODING,
+        "frames": frames,
+        "frames_damaged": damaged,
+        "frames_lost": video.lost_frames,
+        "frames_with_face": with_face,
         "frames_with_several_faces": several,
         "reacquired": follower.reacquired,
         "frames_zoomed": zooming.frames if zooming else 0,
         "zoom_windows": zooming.windows if zooming else 0,
         "average_rate": video.average_rate,
-        # intervals that differ by more than 5 ms; container clocks tick more finely
-        "variable_rate": bool(len(steps) > 1 and np.ptp(steps) > 0.005),
     }
-    if source["frames_with_face"] == 0:
-        raise NoFaceError(f"{path}: no face found in any of its {len(times)} frames")
-    nowhere = FaceDetection(np.full((NUM_LANDMARKS, 3), np.nan), np.full((4, 4), np.nan))
-    samples = Samples(
-        timestamps=np.array(times),
-        landmarks=np.array([(face or nowhere).landmarks for face in found]),
-        head_pose=np.array([(face or nowhere).head_pose for face in found]),
-        valid=np.array([face is not None for face in found]),
-    )
-    fps = settings.fps
-    if fps is None:
-        track, interpolated = samples, np.zeros(len(times), dtype=bool)
-        span = times[-1] - times[0]
-        fps = (len(times) - 1) / span if span > 0 else 1.0
-    else:
-        track, interpolated = resample(samples, fps, settings.max_gap)
-    return FaceTrack(
-        landmarks=track.landmarks.astype(np.float32),
-        valid=track.valid,
-        interpolated=interpolated,
-        timestamps=track.timestamps,
-        head_pose=track.head_pose,
-        jaw=jaw_openings(track.landmarks, track.head_pose, size).astype(np.float32),
-        image_size=size,
-        fps=float(fps),
-        source_timestamps=samples.timestamps,
-        source_valid=samples.valid,
-        source=source,
-        detector=settings.record(detector.description()),
-    )
+    return builder.finish(source, settings.record(detector.description()))
 
 
 def is_track_up_to_date(
@@ -379,4 +485,5 @@ def is_track_up_to_date(
     except RequestError as error:
         raise RequestError(f"{error}; it is in the way of a track, so remove it first") from None
     made_so = dict(track.detector) == settings.record(detector)
-    return made_so and track.source.get("sha256") == source_hash
+    source = {"sha256": source_hash, "decoding": DECODING}
+    return made_so and all(track.source.get(name) == value for name, value in source.items())

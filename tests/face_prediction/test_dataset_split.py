@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from face_prediction.dataset.manifest import ClipEntry, assign_folds, fold_split
 from face_prediction.dataset.sequences import kind_of
-from face_prediction.motion.library import Attribution, read_attributions
+from face_prediction.motion.attribution import Attribution, read_attributions
 from robo_manip_baselines.runs.errors import RequestError
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
 import subprocess
 import sys
+import weakref
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ import pytest
 from face_prediction.commands import extract as extract_command
 from face_prediction.tracking import detector as detector_module
 from face_prediction.tracking import detector as model_file
+from face_prediction.tracking import extract as extract_module
 from face_prediction.tracking.detector import (
     DetectorSettings,
     FaceDetection,
@@ -21,7 +26,8 @@ from face_prediction.tracking.detector import (
     default_model_path,
     find_model,
 )
-from face_prediction.tracking.tracks import load_track
+from face_prediction.tracking.tracks import load_track, save_track
+from face_prediction.tracking.video import VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -141,9 +147,117 @@ def test_bad_videos_are_named_and_the_others_done(tmp_path, write_video, run, ca
     assert run(empty, broken, tmp_path / "absent.mp4", good) == 2
     assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["good.npz"]
     assert "nobody.mp4: no face found in any of its 5 frames" in caplog.text
-    assert "broken.mp4: cannot be opened as a video" in caplog.text
+    assert "broken.mp4: truncated: 326 of its 826 bytes are missing" in caplog.text
     assert "absent.mp4: no such file" in caplog.text
-    assert "1 made, 0 already up to date, 3 refused" in caplog.text
+    names = "nobody.mp4, broken.mp4, absent.mp4"
+    assert f"1 made, 0 already up to date, 3 refused ({names})" in caplog.text
+
+
+def test_a_failure_of_the_program_ends_one_video(tmp_path, write_video, run, monkeypatch, caplog):
+    """The others are made, the exit code is 1, and a second run makes the rest."""
+    videos = [write_video(tmp_path / f"{name}.mp4", [picture(20)] * 5) for name in "abc"]
+    detect = StandIn.detect
+
+    def fails(self, image: np.ndarray, time: float) -> list[FaceDetection]:
+        if StandIn.looked == 7:
+            StandIn.looked += 1
+            raise ValueError("Input timestamp must be monotonically increasing.")
+        return detect(self, image, time)
+
+    monkeypatch.setattr(StandIn, "detect", fails)
+    assert run(*videos) == 1
+    assert "b.mp4: ValueError: Input timestamp must be" in caplog.text
+    assert "2 made, 0 already up to date, 0 refused, 1 failed (b.mp4)" in caplog.text
+    assert run(*videos) == 0
+    assert "1 made, 2 already up to date, 0 refused" in caplog.text
+    assert sorted(path.name for path in (tmp_path / "tracks").iterdir()) == [
+        "a.npz", "b.npz", "c.npz",
+    ]  # fmt: skip
+
+
+def test_a_full_disk_ends_the_batch_with_whole_files(
+    tmp_path, write_video, run, monkeypatch
+) -> None:
+    videos = [write_video(tmp_path / f"{name}.mp4", [picture(20)] * 5) for name in "abc"]
+    write = np.savez_compressed
+
+    def full(stream, **arrays) -> None:
+        if len(list((tmp_path / "tracks").glob("*.npz"))) == 1:
+            stream.write(b"half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(stream, **arrays)
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space left"):
+        run(*videos)
+    assert StandIn.looked == 10  # the third video is not begun
+    assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["a.npz"]
+
+
+def test_damaged_frames_are_not_looked_at(tmp_path, write_video, run, monkeypatch, caplog) -> None:
+    video = write_video(tmp_path / "ann.mp4", [picture(20)] * 30)
+    frames = VideoReader.frames
+
+    def damaged(self):
+        for number, frame in enumerate(frames(self)):
+            yield replace(frame, is_damaged=10 <= number < 14)
+        self.lost_frames = 2
+
+    monkeypatch.setattr(VideoReader, "frames", damaged)
+    assert run(video) == 0
+    assert StandIn.looked == 26
+    track = load_track(tmp_path / "tracks" / "ann.npz")
+    assert np.flatnonzero(~track.valid).tolist() == [10, 11, 12, 13]
+    assert "30 frames, face in 86.7 %; 4 damaged and 2 lost of the video's 32" in caplog.text
+    monkeypatch.setattr(
+        VideoReader, "frames", lambda self: (replace(f, is_damaged=True) for f in frames(self))
+    )
+    assert run(video, "--max_gap", 0.2) == 2
+    assert "no face found in any of its 30 frames, 30 of which are damaged" in caplog.text
+
+
+def test_a_track_of_an_older_decoding_is_made_again(tmp_path, write_video, run) -> None:
+    video = write_video(tmp_path / "ann.mp4", [picture(20)] * 5)
+    assert run(video) == 0
+    path = tmp_path / "tracks" / "ann.npz"
+    track = load_track(path)
+    save_track(path, replace(track, source={**track.source, "decoding": 1}))
+    assert run(video) == 0
+    assert StandIn.looked == 10
+
+
+def test_few_frames_and_faces_are_held(tmp_path, write_video, run, monkeypatch) -> None:
+    """However long the video is: a chunk of faces, and a handful of images."""
+    monkeypatch.setattr(extract_module, "CHUNK", 8)
+    alive = {"images": 0, "faces": 0}
+    most = {"images": 0, "faces": 0}
+
+    def follow(what: str, item: object) -> None:
+        alive[what] += 1
+        most[what] = max(most[what], alive[what])
+        weakref.finalize(item, lambda: alive.update({what: alive[what] - 1}))
+
+    frames, detect = VideoReader.frames, StandIn.detect
+
+    def followed_frames(self):
+        for frame in frames(self):
+            follow("images", frame)
+            yield frame
+            del frame
+
+    def followed_faces(self, image: np.ndarray, time: float) -> list[FaceDetection]:
+        faces = detect(self, image, time)
+        for face in faces:
+            follow("faces", face)
+        return faces
+
+    video = write_video(tmp_path / "ann.mp4", [picture(10 + n // 4) for n in range(120)])
+    monkeypatch.setattr(VideoReader, "frames", followed_frames)
+    monkeypatch.setattr(StandIn, "detect", followed_faces)
+    assert run(video) == 0
+    assert len(load_track(tmp_path / "tracks" / "ann.npz")) == 120
+    assert most["images"] <= 3
+    assert most["faces"] <= 8 + 3  # the chunk, the newest, and the one that is followed
 
 
 def test_a_killed_run_leaves_whole_files_and_carries_on(
@@ -223,6 +337,35 @@ def test_native_noise_is_shown_only_when_something_fails(capfd) -> None:
     assert capfd.readouterr().err == "noise"
 
 
+def test_the_clock_of_video_mode_goes_forward(tmp_path: Path) -> None:
+    """Times that share a millisecond, begin below 0, or begin late."""
+    clocks: list[int] = []
+
+    class Landmarker:
+        def detect_for_video(self, image: object, clock: int) -> SimpleNamespace:
+            clocks.append(clock)
+            return SimpleNamespace(face_landmarks=[], facial_transformation_matrixes=[])
+
+    def detector() -> FaceDetector:
+        made = object.__new__(FaceDetector)
+        formats = SimpleNamespace(SRGB=0)
+        made._mediapipe = SimpleNamespace(ImageFormat=formats, Image=lambda **_: None)
+        made._landmarker, made._follows, made._warm = Landmarker(), True, True
+        made._begun, made._clock = None, -1
+        return made
+
+    for times, expected in (
+        ([0.0, 0.0333, 0.0334, 0.0337, 0.0667], [0, 33, 34, 35, 67]),
+        ([-0.1, -0.0667, 0.0], [0, 33, 100]),
+        ([7.5, 7.5333], [7500, 7533]),
+    ):
+        clocks.clear()
+        looking = detector()
+        for time in times:
+            looking.detect(np.zeros((4, 4, 3), dtype=np.uint8), time)
+        assert clocks == expected
+
+
 class TestModelFile:
     """Source of the model."""
 
@@ -262,6 +405,13 @@ class TestModelFile:
         with pytest.raises(RequestError, match=r"fetch file:.*--model") as caught:
             find_model(None, nowhere, "0")
         assert "\n" not in str(caught.value)
+
+    def test_the_option_of_the_command_is_named(self, tmp_path: Path) -> None:
+        nowhere = (tmp_path / "nothing").as_uri()
+        with pytest.raises(RequestError, match="name it with --detector_model$"):
+            find_model(None, nowhere, "0", option="--detector_model")
+        with pytest.raises(RequestError, match=r"^--detector_model .*no such file"):
+            find_model(tmp_path / "absent.task", option="--detector_model")
 
     def test_a_named_model_must_exist(self, tmp_path: Path) -> None:
         with pytest.raises(RequestError, match=r"no such file; download it from https://"):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from face_prediction.tracking.extract import MAX_GAP, Samples, resample
+from face_prediction.tracking.extract import MAX_GAP, Resampler, Samples, resample
 
 
 def moving(times: np.ndarray, valid: np.ndarray | None = None) -> Samples:
@@ -108,3 +108,21 @@ def test_against_a_slow_oracle(steps: list[float], lost: set[int], fps: float) -
         assert np.isfinite(pose).all() == expected
         if expected:
             assert pose[0, 3] == pytest.approx(0.1 * time, abs=1.1e-4)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 9, 40])
+@pytest.mark.parametrize("chunk", [1, 2, 4, 8])
+def test_chunks_give_the_same_bit_for_bit(count: int, chunk: int) -> None:
+    random = np.random.default_rng(count)
+    times = np.cumsum(random.uniform(0.001, 0.09, count)) + random.uniform(-1, 9)
+    source = moving(times, random.random(count) > 0.2)
+    whole, interpolated = resample(source, 30.0)
+    resampler = Resampler(30.0)
+    parts = []
+    for begin in range(0, count, chunk):
+        part = Samples(*(array[begin : begin + chunk] for array in vars(source).values()))
+        parts.append(resampler.add(part, is_last=begin + chunk >= count))
+    for name, expected in vars(whole).items():
+        got = np.concatenate([getattr(samples, name) for samples, _ in parts])
+        np.testing.assert_array_equal(got, expected)
+    np.testing.assert_array_equal(np.concatenate([made for _, made in parts]), interpolated)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import resource
+import signal
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import av
@@ -14,6 +17,7 @@ import pytest
 from face_prediction.commands import live as live_command
 from face_prediction.commands.live import LiveOptions, run_live
 from face_prediction.live import loop as display
+from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -45,7 +49,7 @@ class DrawnFaces:
 def faces(monkeypatch, landmarks) -> DrawnFaces:
     drawn = DrawnFaces(landmarks)
     monkeypatch.setattr(live_command, "face_finder", lambda model: nullcontext(drawn.find))
-    monkeypatch.setattr(live_command, "find_model", lambda given: given)
+    monkeypatch.setattr(live_command, "find_model", lambda given, option: given)
     return drawn
 
 
@@ -127,6 +131,10 @@ def test_a_truncated_video_leaves_no_file(clip: Path, faces, tmp_path: Path) -> 
         ({"camera": 0}, "either --camera NUMBER or --video FILE"),
         ({"video": Path("/nowhere.mp4")}, "no such file"),
         ({"seconds": 0.0}, "--seconds 0.0: must be positive"),
+        ({"seconds": float("nan")}, "--seconds nan: must be positive"),
+        ({"video": None, "camera": -1}, "--camera -1: valid: 0 to 99"),
+        ({"video": None, "camera": 100}, "--camera 100: valid: 0 to 99"),
+        ({"video": None, "camera": 2**63}, "--camera 9223372036854775808: valid: 0 to 99"),
         ({"out": Path("/")}, "is a folder"),
         ({"out": Path("film.avi")}, "name an .mp4 file"),
         ({"checkpoint": "ar_landmarks"}, "has parameters; name a --dataset"),
@@ -139,6 +147,45 @@ def test_what_cannot_be_done_is_refused(clip, faces, tmp_path, changes, message:
         run_live(replace(options, **changes))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out.mp4").exists()
+
+
+def test_without_a_model_the_option_that_live_has_is_named(clip, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    nowhere = (tmp_path / "nothing").as_uri()
+    monkeypatch.setattr(live_command, "find_model", partial(find_model, url=nowhere))
+    with pytest.raises(RequestError, match="name it with --detector_model$"):
+        run_live(LiveOptions(video=clip, checkpoint="line", out=tmp_path / "out.mp4"))
+    assert not (tmp_path / "out.mp4").exists()
+
+
+def test_damaged_frames_are_shown_and_not_measured(clip, faces, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    frames = VideoReader.frames
+    monkeypatch.setattr(
+        VideoReader,
+        "frames",
+        lambda self: (replace(f, is_damaged=n > 14) for n, f in enumerate(frames(self))),
+    )
+    out = tmp_path / "out.mp4"
+    assert run_live(LiveOptions(video=clip, checkpoint="persistence", out=out)) == 0
+    assert faces.count == 14
+    assert "face in 15 of 20 frames" in caplog.text
+    assert len(read(out)) == 20
+
+
+def test_a_full_disk_leaves_no_file(clip: Path, faces, tmp_path: Path) -> None:
+    out = tmp_path / "out.mp4"
+    options = LiveOptions(video=clip, checkpoint="line", out=out)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            run_live(options)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["clip.mp4"]
 
 
 def test_the_video_itself_is_not_overwritten(clip: Path, faces) -> None:

@@ -125,6 +125,16 @@ def test_a_file_keeps_the_times_of_its_images(tmp_path: Path) -> None:
     )
 
 
+def test_times_below_zero_begin_a_file_at_zero(tmp_path: Path) -> None:
+    """A file holds no such times; the images keep their distances."""
+    times = np.array([-0.5, -0.4, -0.05, 0.0, 0.1])
+    path = tmp_path / "early.mp4"
+    with video_sink(path, 25.0) as show:
+        for time in times:
+            assert show(np.zeros((32, 32, 3), dtype=np.uint8), time)
+    assert [frame.time for frame in read(path)] == pytest.approx(times + 0.5, abs=1e-4)
+
+
 def test_a_file_without_images_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="no image to write"), video_sink(tmp_path / "a.mp4", 30):
         pass

@@ -1,0 +1,56 @@
+"""Reading videos: times of frames, and refusal of what is no video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from face_prediction.tracking.video import VideoReader, require_video
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import file_digest
+
+pytestmark = pytest.mark.long
+
+
+def corner(width: int = 80, height: int = 48) -> np.ndarray:
+    """A dark picture with a bright red square in its top left corner."""
+    image = np.zeros((height, width, 3), dtype=np.uint8)
+    image[:16, :16, 0] = 255
+    return image
+
+
+def read(path: Path) -> list:
+    with VideoReader(path) as video:
+        return list(video.frames())
+
+
+def test_times_of_a_variable_rate(tmp_path: Path, write_video) -> None:
+    times = [0.0, 0.04, 0.1, 0.15, 0.35, 0.36, 0.5]
+    frames = read(write_video(tmp_path / "v.mp4", [corner()] * 7, times))
+    np.testing.assert_allclose([frame.time for frame in frames], times, atol=1e-4)
+
+
+def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
+    text = tmp_path / "notes.mp4"
+    text.write_text("not a video at all\n" * 50)
+    with pytest.raises(RequestError, match="cannot be opened as a video"):
+        VideoReader(text)
+    empty = tmp_path / "empty.mp4"
+    empty.touch()
+    for path, message in (
+        (tmp_path, "is a folder"),
+        (empty, "is empty"),
+        (tmp_path / "absent.mp4", "no such file"),
+    ):
+        with pytest.raises(RequestError, match=message) as caught:
+            require_video(path)
+        assert str(path) in str(caught.value)
+
+
+def test_hash_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "abc"
+    path.write_bytes(b"abc")
+    # FIPS 180-2, appendix B.1
+    assert file_digest(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
