@@ -127,7 +127,9 @@ def attribute_of(file: h5py.Group | h5py.Dataset, name: str) -> Any:
     is_text = kind.get_class() == low.h5t.STRING and item.shape == ()
     if not is_text and kind.get_class() not in (low.h5t.INTEGER, low.h5t.FLOAT, low.h5t.ENUM):
         raise ValueError(f"attribute '{name}' is neither a number nor text")
-    if item.shape is None or item.get_storage_size() > MAX_ATTRIBUTE:
+    if item.shape is None:
+        raise ValueError(f"attribute '{name}' is empty")
+    if item.get_storage_size() > MAX_ATTRIBUTE:
         raise ValueError(f"attribute '{name}' has {item.get_storage_size()} bytes")
     if is_text and kind.is_variable_str():
         return file.attrs[name]
