@@ -107,8 +107,9 @@ class VideoReader:
             if stream is None:
                 raise self._wrong("holds no video stream")
             self._stream = stream
-            # a thread per frame would lose as many frames as there are threads at an error
-            stream.thread_type = "SLICE"
+            # with more threads FFmpeg flags damaged frames by chance: of two in a clip both, one or
+            # none; and detection takes several times as long as decoding
+            stream.codec_context.thread_count = 1
             # crop as the codec says to the pixel, not to the alignment of memory
             stream.codec_context.flags |= Flags.unaligned
             # AVI: numbers of the chunks, which are in decoding order (k-th image: k-th number)

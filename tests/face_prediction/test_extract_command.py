@@ -408,7 +408,7 @@ class TestModelFile:
 
     def test_the_option_of_the_command_is_named(self, tmp_path: Path) -> None:
         nowhere = (tmp_path / "nothing").as_uri()
-        with pytest.raises(RequestError, match="name it with --detector_model$"):
+        with pytest.raises(RequestError, match=r"name it with --detector_model$"):
             find_model(None, nowhere, "0", option="--detector_model")
         with pytest.raises(RequestError, match=r"^--detector_model .*no such file"):
             find_model(tmp_path / "absent.task", option="--detector_model")
