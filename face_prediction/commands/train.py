@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from face_prediction.training.options import FaceTrainOptions
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 
 
 def run_train(options: FaceTrainOptions) -> int:
@@ -21,6 +22,6 @@ def run_train(options: FaceTrainOptions) -> int:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        install = "pip install 'robo_manip_baselines[face-prediction]'"
-        raise RequestError(f"training needs PyTorch; {install}") from None
+        install = install_command("face-prediction")
+        raise RequestError(f"training needs PyTorch; run: {install}") from None
     return train_predictor(options)

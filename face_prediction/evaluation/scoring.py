@@ -19,6 +19,7 @@ from face_prediction.evaluation.setup import EvaluationSetup, SequenceSelection
 from face_prediction.prediction.errors import mouth_residuals, normalised_mean_errors
 from face_prediction.prediction.interface import Forecast, ImageNeeds
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 
 Floats = NDArray[np.float64]
 
@@ -54,8 +55,7 @@ def similarities(forecast: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Float
         from skimage.metrics import structural_similarity
     except ImportError as error:
         raise RequestError(
-            f"SSIM needs scikit-image ({error}); pip install "
-            "'robo_manip_baselines[face_prediction]'"
+            f"SSIM needs scikit-image ({error}); run: {install_command('face-prediction')}"
         ) from None
     wang = {"gaussian_weights": True, "sigma": SSIM_SIGMA, "use_sample_covariance": False}
     ours, true = forecast.astype(np.float32), truth.astype(np.float32)

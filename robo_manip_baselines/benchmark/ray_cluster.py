@@ -25,6 +25,7 @@ from robo_manip_baselines.benchmark.work_item import (
 )
 from robo_manip_baselines.benchmark.worker import end_worker, last_line, start_worker
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ class RayExecutor:
             from ray import exceptions
         except ImportError as error:
             raise RequestError(
-                f"--executor ray needs Ray ({error}); pip install 'robo_manip_baselines[ray]'"
+                f"--executor ray needs Ray ({error}); run: {install_command('ray')}"
             ) from None
         self._ray, self._exceptions, self._store = ray, exceptions, store
         self._is_ours = not ray.is_initialized()

@@ -6,6 +6,7 @@ import os
 from importlib.util import find_spec
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 
 PACKAGES = {
     "torch": "torch",
@@ -38,7 +39,7 @@ def prepare_pytorch() -> None:
     missing = [name for module, name in PACKAGES.items() if find_spec(module) is None]
     if missing:
         raise RequestError(
-            f"policies need {', '.join(missing)}: pip install 'robo_manip_baselines[train]' "
+            f"policies need {', '.join(missing)}; run: {install_command('train')} "
             "(for a machine without a GPU add "
             "--extra-index-url https://download.pytorch.org/whl/cpu)"
         )

@@ -19,6 +19,7 @@ from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.checkpoints import prune_checkpoints, step_folder
 from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import pip_install
 from robo_manip_baselines.runs.files import locked
 from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
@@ -103,7 +104,7 @@ def _train(
             if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
                 logger.info("curves: %s", run / CURVES)
             else:
-                logger.info("no image of the curves: pip install matplotlib")
+                logger.info("no image of the curves; run: %s", pip_install("matplotlib"))
     return 0
 
 

@@ -20,6 +20,7 @@ from robo_manip_baselines.benchmark.tables.benchmark import benchmark_tables
 from robo_manip_baselines.benchmark.tables.table import Table
 from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import write_text
 
 FOLDER = Path(__file__).parent
@@ -169,7 +170,7 @@ def render_report(report: Report) -> str:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
     except ImportError as error:
         raise RequestError(
-            f"reports need Jinja ({error}); pip install 'robo_manip_baselines[train]'"
+            f"reports need Jinja ({error}); run: {install_command('train')}"
         ) from None
     environment = Environment(
         loader=FileSystemLoader(FOLDER),
