@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.progress import track
 
 WHOLE_SHARE = 0.9
 """A video that decodes to less than this share of the frames in its header is refused as truncated,
@@ -130,5 +130,4 @@ def with_bar(
     frames: Iterable[VideoFrame], total: int | None, label: str | None
 ) -> Iterable[VideoFrame]:
     """Pass on ``frames`` (``total``, if known) under a progress bar ``label``; None: no bar."""
-    disable = label is None
-    return tqdm(frames, total=total, desc=label, unit="frame", leave=False, disable=disable)
+    return track(frames, total, "frame", label or "", shown=label is not None, keep=False)

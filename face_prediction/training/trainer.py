@@ -353,7 +353,7 @@ class PredictorTrainer:
         options, settings, seed = self._options, self._settings, self._options.seed
         model, optimizer, progress = self._model, self._optimizer, self.progress
         done = (settings.steps, progress.step, progress.seconds)
-        bar = StepProgress(*done, shown=options.progress, log_every=options.log_every)
+        bar = StepProgress(*done, shown=options.progress)
         batches = window_batches(self._windows, settings, seed, progress.step)
         log = MetricsLog(options.folder / METRICS_FILE, progress.step, board=None)
         with bar, log, contextlib.closing(batches):

@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
-
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
@@ -33,6 +31,7 @@ from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_json
+from robo_manip_baselines.runs.progress import EpisodeProgress
 from robo_manip_baselines.runs.versions import software_versions
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
@@ -239,7 +238,7 @@ class EvaluationPlan:
         if not seeds:
             return
         checkpoint, successes = self.checkpoint, 0
-        num_envs = min(self.config.num_envs, len(seeds))
+        num_envs, longest = min(self.config.num_envs, len(seeds)), self.env.task.max_episode_steps
         origin: dict[str, Any] = {
             "policy": checkpoint.policy,
             "condition": self.condition,
@@ -251,17 +250,18 @@ class EvaluationPlan:
         with (
             self._one_thread_if_small(),
             open_envs(self.env, num_envs, self.config.workers) as envs,
-            tqdm(total=len(seeds), unit="episode", desc=checkpoint.policy) as progress,
+            EpisodeProgress(len(seeds), longest, checkpoint.policy) as progress,
         ):
 
             def finished(result: EpisodeResult, recording: Recording) -> None:
                 nonlocal successes
                 successes += result.is_success
                 on_episode(replace(result, **origin), recording)
-                progress.set_postfix_str(f"{successes} succeeded", refresh=False)
-                progress.update()
+                progress.note = f"{successes} succeeded"
+                progress.end(result.steps)
 
-            rollout(self.make_policy(num_envs), envs, seeds, on_episode=finished)
+            policy = self.make_policy(num_envs)
+            rollout(policy, envs, seeds, on_episode=finished, on_steps=progress.step)
 
     @contextlib.contextmanager
     def _one_thread_if_small(self) -> Iterator[None]:

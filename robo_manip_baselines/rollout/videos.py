@@ -16,7 +16,6 @@ import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from robo_manip_baselines.data import EpisodeReader, read_metadata
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
@@ -27,6 +26,7 @@ from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
 from robo_manip_baselines.rollout.workers import EnvConfig
 from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.progress import track
 
 Colour = tuple[int, int, int]
 
@@ -230,7 +230,7 @@ def write_preview(path: Path, episodes: Sequence[Path]) -> None:
 
 def _write_frames(path: Path, frames: Iterable[np.ndarray], total: int) -> None:
     with VideoWriter(path, FPS) as video:
-        for frame in tqdm(frames, path.name, total, unit="frame", mininterval=1.0):
+        for frame in track(frames, total, "frame", path.name):
             video.write(frame)
 
 

@@ -148,7 +148,7 @@ class Trainer:
         seconds = self.state.restore(start) if start else 0.0
         self._saved_step = start.step if start else 0
         done = setup.total_steps, self._saved_step, seconds
-        self._progress = StepProgress(*done, shown=processes.is_main, log_every=config.log_every)
+        self._progress = StepProgress(*done, shown=processes.is_main)
         self._timer = StepTimer(device)
         loss: nn.Module = _LossModule(model)
         if processes.world_size > 1:
