@@ -24,10 +24,12 @@ from robo_manip_baselines.data import (
     EpisodeReader,
     episode_path,
     finished_seeds,
+    list_episodes,
     read_metadata,
     remove_partial_episodes,
     write_episode,
 )
+from robo_manip_baselines.data.files import list_failures, seed_of
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id, make_env, task_entry
 from robo_manip_baselines.policy.presets import require_at_least
@@ -168,9 +170,10 @@ class Collection:
 
 @dataclass(frozen=True)
 class CollectionSummary:
-    """Summary of a collection.
+    """Summary of all episodes of a folder, those of earlier calls included.
 
     Attributes:
+        first_seed: smallest seed.
         episodes: how many there are.
         successes, strict_successes: how many of them succeeded.
         failed_seeds: seeds that did not.
@@ -179,6 +182,7 @@ class CollectionSummary:
         steps_per_second: of this run, all workers together; None if nothing was left to do.
     """
 
+    first_seed: int
     episodes: int
     successes: int
     strict_successes: int
@@ -215,12 +219,11 @@ def collect(collection: Collection) -> CollectionSummary:
                 steps += count
                 progress.end(count)
         elapsed = time.perf_counter() - begin
-    summary = _summarize(collection, steps, steps / elapsed if todo else None)
+    summary = _summarize(collection.out, steps, steps / elapsed if todo else None)
     content = {
         "env": task_entry(collection.env).env_id,
         "env_kwargs": collection.env_kwargs,
         "expert": collection.expert,
-        "first_seed": collection.seeds.start,
         "workers": collection.workers,
         **asdict(summary),
     }
@@ -228,18 +231,17 @@ def collect(collection: Collection) -> CollectionSummary:
     return summary
 
 
-def _summarize(
-    collection: Collection, steps: int, steps_per_second: float | None
-) -> CollectionSummary:
-    """Summarize the files of a collection."""
-    paths = {seed: collection.path(seed) for seed in collection.seeds}
-    outcomes = {seed: read_metadata(path) for seed, path in paths.items() if path}
+def _summarize(folder: Path, steps: int, steps_per_second: float | None) -> CollectionSummary:
+    """Summarize all episodes of a folder."""
+    paths = {seed_of(path): path for path in list_episodes(folder) + list_failures(folder)}
+    seeds = sorted(seed for seed in paths if seed is not None)
+    outcomes = {seed: read_metadata(paths[seed]) for seed in seeds}
     times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
     mean, sd = completion_time(times)
     strict = sum(bool(o["is_success_strict"]) for o in outcomes.values())
     failed = [seed for seed, o in outcomes.items() if not o["is_success"]]
     return CollectionSummary(
-        len(outcomes), len(times), strict, failed, mean, sd, steps, steps_per_second
+        min(outcomes), len(outcomes), len(times), strict, failed, mean, sd, steps, steps_per_second
     )
 
 

@@ -319,8 +319,13 @@ def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummar
         plan.run(todo, on_episode)
         seconds = time.perf_counter() - begin
         results = file.of(seeds)
-    summary = summarize(plan.env.task, results, new=len(todo), seconds=seconds)
-    write_json(plan.out / SUMMARY, {**plan.facts, **asdict(summary)})
+        everything = file.of(sorted(file.done))
+    # Of all rows of the folder: a table of results.jsonl has the same numbers.
+    summary = summarize(plan.env.task, everything, new=len(todo), seconds=seconds)
+    facts = {**plan.facts, "first_seed": everything[0].seed}
+    write_json(plan.out / SUMMARY, {**facts, **asdict(summary)})
+    if len(everything) > len(results):
+        logger.info("the summary is over all %d episodes of %s", len(everything), plan.out)
 
     videos = {plan.out / VIDEOS / video_name(r): r for r in pick_for_video(results, number)}
     missing = {path: result for path, result in videos.items() if not path.exists()}

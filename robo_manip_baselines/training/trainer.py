@@ -86,7 +86,8 @@ def _train(
             stack.enter_context(locked(config.folder))
         start = setup.find_start(resume)
         if start and start.step >= setup.total_steps:
-            logger.info("%s is finished: %d steps", config.folder, start.step)
+            done = config.folder, start.step
+            logger.info("%s is finished: %d steps; a larger --steps extends it", *done)
         else:
             processes.wait()  # until every process has seen the folder as it was
             log = stack.enter_context(setup.open_log(start)) if processes.is_main else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -161,6 +162,41 @@ def test_what_a_run_folder_holds_is_respected(
     assert train(f"{args} --resume --device cpu".split()) == 0
     assert f"--policy Mlp --checkpoint {run}" in capsys.readouterr().out
     assert weights(run) == before
+
+
+def test_a_finished_run_is_extended_from_its_folder(line: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert train(f"Mlp {line} --steps 4".split()) == 0
+    with pytest.raises(RequestError, match="with steps 4, not 6; --resume extends it"):
+        train(f"Mlp {line} --steps 6".split())
+    assert train(f"Mlp --out {run} --resume --steps 6".split()) == 0
+    assert read_checkpoint(run).step == 6
+    assert train(f"Mlp --out {run} --resume".split()) == 0  # the new budget is the run's own
+
+
+@pytest.mark.parametrize("folder", ["act_currnet", "new/act_current", "."])
+def test_a_mistyped_folder_is_not_a_new_run(line: str, folder: str, tmp_path: Path) -> None:
+    for name in ("act_current", "act_baseline", "notes"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / ("notes.txt" if name == "notes" else "config.yaml")).touch()
+    before = sorted(tmp_path.rglob("*"))
+    given = tmp_path / folder
+    with pytest.raises(RequestError, match=r"--resume: '.*' holds no run; ") as refusal:
+        train(f"Mlp {line} --resume --out {given}".split())
+    if folder == "act_currnet":
+        near = f"there are '{tmp_path / 'act_current'}', '{tmp_path / 'act_baseline'}'"
+        assert near in str(refusal.value)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_run_without_a_checkpoint_yet_is_resumed_from_its_start(
+    line: str, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    train(f"Mlp {line} --steps 2".split())
+    shutil.rmtree(run / "checkpoints")
+    assert train(f"Mlp --out {run} --resume".split()) == 0
+    assert read_checkpoint(run).step == 2
 
 
 def test_an_unfinished_run_needs_resume(line: str, tmp_path: Path) -> None:
