@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -165,6 +166,52 @@ def test_opengl_check_prints_the_apt_line_when_it_may_not_install(
     assert "no libEGL" in message
     assert "run: sudo apt-get update && sudo apt-get install -y" in message
     assert "libegl1" in message
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"MUJOCO_EGL_DEVICE_ID": "99"}, "MUJOCO_EGL_DEVICE_ID=99: there is no such EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": "-1"}, "MUJOCO_EGL_DEVICE_ID=-1: there is no such EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": "gpu"}, "='gpu': must be the number of an EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": ""}, "='': must be the number of an EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": "1"}, r"=1: this EGL device cannot draw \[it broke\]"),
+        ({"PYOPENGL_PLATFORM": "glx"}, "PYOPENGL_PLATFORM=glx: does not go with MUJOCO_GL=egl"),
+        ({"MUJOCO_GL": "glfw", "DISPLAY": ""}, "needs a display"),
+    ],
+)
+def test_a_wrong_variable_is_no_missing_library(
+    variables: dict[str, str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(opengl_check, "_count_egl_devices", lambda: 3)
+    line = opengl_check.explain_failure(opengl_check.backend_in_use(), "it broke")
+    assert re.search(message, line)
+    assert "apt-get" not in line
+    if "MUJOCO_EGL_DEVICE_ID" in variables:
+        assert "there are 3, valid: 0 to 2, or unset it" in line
+
+
+@pytest.mark.gl
+def test_opengl_check_knows_how_many_devices_there_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "4096")
+    assert opengl_check.main(["--install"]) == 2
+    message = capsys.readouterr().err
+    assert re.search(r"=4096: there is no such EGL device; there (is|are) \d+, valid: 0", message)
+    assert message.count("\n") == 1
+
+
+def test_without_egl_the_library_is_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "0")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    monkeypatch.setattr(opengl_check, "_count_egl_devices", lambda: 0)
+    assert "apt-get install" in opengl_check.explain_failure("egl", "no libEGL")
 
 
 def test_opengl_check_installs_at_once_when_root(
