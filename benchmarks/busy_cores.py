@@ -21,13 +21,14 @@ from statistics import median
 CORES = len(os.sched_getaffinity(0))
 
 SETTINGS: dict[str, dict[str, str]] = {
-    "PyTorch's own": {"GOMP_SPINCOUNT": "", "OMP_NUM_THREADS": str(CORES)},
+    # GNU OpenMP's own count where there are no more threads than cores: some milliseconds
+    "PyTorch's own": {"GOMP_SPINCOUNT": "300000", "OMP_NUM_THREADS": str(CORES)},
+    "as chosen by the load": {"OMP_NUM_THREADS": str(CORES)},
     "GOMP_SPINCOUNT=3000": {"GOMP_SPINCOUNT": "3000", "OMP_NUM_THREADS": str(CORES)},
     "GOMP_SPINCOUNT=0": {"GOMP_SPINCOUNT": "0", "OMP_NUM_THREADS": str(CORES)},
-    "OMP_WAIT_POLICY=PASSIVE": {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": str(CORES)},
     "one thread": {"GOMP_SPINCOUNT": "3000", "OMP_NUM_THREADS": "1"},
 }
-"""Name -> environment of the training; an empty variable is left to OpenMP."""
+"""Name -> environment of the training."""
 
 BENCHMARK = Path(__file__).with_name("train_step.py")
 
@@ -48,18 +49,12 @@ def steps_per_second(setting: dict[str, str], steps: int) -> float:
     """Train for so many steps and return the speed after the warm-up."""
     command = [sys.executable, str(BENCHMARK), "Act", "--preset", "cpu", f"--steps={steps}"]
     env = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
-    if setting.get("GOMP_SPINCOUNT") == "":  # as `prepare_pytorch` would set one
-        setting = {**setting, "OMP_WAIT_POLICY": "", "GOMP_SPINCOUNT": DEFAULT_SPINS}
     output = subprocess.run(
         command, env={**env, **setting}, check=True, capture_output=True, text=True
     ).stdout
     match = re.search(r"\| step \| ([0-9.]+) \|", output)
     assert match is not None, output
     return 1e3 / float(match[1])
-
-
-DEFAULT_SPINS = "300000"
-"""GNU OpenMP's own count where there are no more threads than cores; some milliseconds."""
 
 
 def main() -> None:

@@ -48,6 +48,8 @@ class RayExecutor:
     """
 
     def __init__(self, store: ArtifactStore, address: str | None) -> None:
+        place = "on this machine" if address is None else f"cluster at {address}"
+        logger.info("connecting to Ray: %s", place)
         try:
             import ray
             from ray import exceptions

@@ -260,6 +260,7 @@ def _record_all(
         for seed in seeds:
             yield _record(collection, env, seed, on_steps)
         return
+    logger.info("starting %d worker processes", workers)
     # Spawned, not forked: an OpenGL context does not survive a fork.
     context = get_context("spawn")
     counter, seen = context.Value("q", 0), 0

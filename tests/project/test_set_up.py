@@ -105,6 +105,42 @@ def test_installed_is_installed(bare_tree: Path) -> None:
     assert len(log.read_text().splitlines()) == 2
 
 
+PIP_SAYS = """Obtaining file:///x
+  Installing build dependencies: started
+Collecting av>=14.0 (from robo_manip_baselines==0.1.0)
+  Downloading av-14.0.0-cp311-cp311-manylinux.whl.metadata (4.7 kB)
+Collecting torch>=2.6
+Downloading av-14.0.0-cp311-cp311-manylinux_2_28_x86_64.whl (9.9 MB)
+Downloading https://pytorch.org/whl/torch-2.13.0-cp311-cp311-linux_x86_64.whl (190.4 MB)
+Downloading nvidia_cublas-12.8-py3-none-manylinux_2_27_x86_64.whl (1.2 GB)
+Installing collected packages: av, torch, nvidia_cublas
+Successfully installed av torch nvidia_cublas
+"""
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_an_install_is_not_silent(bare_tree: Path, code: int) -> None:
+    """A line for each stage, with the time; all that pip says only where it fails."""
+    venv = bare_tree / ".venv" / "bin"
+    venv.mkdir(parents=True)
+    (bare_tree / "says").write_text(PIP_SAYS)
+    python = venv / "python"
+    script = f"[ $1 = -c ] && echo 3.11 && exit 0\ncat {bare_tree / 'says'}; exit {code}\n"
+    python.write_text(f"#!/bin/sh\n{script}", encoding="utf-8")
+    python.chmod(0o755)
+    result = set_up(bare_tree)
+    assert result.returncode == code
+    lines = [re.sub(r"\b\d+ s\b", "N s", line) for line in result.stdout.splitlines()]
+    assert lines[1:5] == [
+        "set-up: N s: looking up packages",
+        "set-up: N s: downloading torch-2.13.0-cp311-cp311-linux_x86_64.whl (190.4 MB)",
+        "set-up: N s: downloading nvidia_cublas-12.8-py3-none-manylinux_2_27_x86_64.whl (1.2 GB)",
+        "set-up: N s: installing 3 packages",
+    ]
+    assert lines[5:] == ([] if code else ["set-up: installed after N s"])
+    assert ("Successfully installed" in result.stderr) == bool(code)
+
+
 def test_help_lists_the_targets(repository: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
     listing = subprocess.run(
