@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from face_prediction.dataset.clip_file import open_clip, read_array, read_record
 from face_prediction.dataset.image_batches import SequenceBatch
@@ -37,6 +36,7 @@ from face_prediction.prediction.errors import mouth_residuals
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import require_out_file
+from robo_manip_baselines.runs.progress import ProgressBar
 
 logger = logging.getLogger(__name__)
 
@@ -137,12 +137,12 @@ def dataset_residuals(
     settings = dataset.manifest.settings
     truth = np.stack([dataset.landmarks(i)[settings.history :, :, :2] for i in selection.indices])
     forecasts = np.empty_like(truth)
-    with tqdm(total=len(truth), unit="sequence", leave=False, disable=not progress) as bar:
+    with ProgressBar(len(truth), "sequence", shown=progress, keep=False) as bar:
         for places in selection.batches(min(map(batch_size, predictor.needs))):
             indices = selection.indices[places].tolist()
             batch = SequenceBatch(dataset, indices, predictor.needs)
             forecasts[places] = predictor.forecast(selection.rows_at(places), batch).landmarks
-            bar.update(len(places))
+            bar.advance(len(places))
     return MouthResiduals(
         mouth_residuals(forecasts, truth),
         clips=[row.clip for row in selection.rows],

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from face_prediction.dataset.build import find_videos, source_video
 from face_prediction.dataset.histories import (
@@ -42,6 +41,7 @@ from face_prediction.prediction.interface import Predictor
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
+from robo_manip_baselines.runs.progress import ProgressBar
 
 logger = logging.getLogger(__name__)
 
@@ -220,9 +220,8 @@ def forecast_clip(
         )
     size = batch_size(predictor.needs)
     result: list[NDArray[np.float64]] = []
-    with tqdm(
-        total=len(origins), desc=clip.row.clip, unit="frame", leave=False, disable=not progress
-    ) as bar:
+    label = clip.row.clip
+    with ProgressBar(len(origins), "frame", label, shown=progress, keep=False) as bar:
         for first in range(0, len(origins), size):
             some = origins[first : first + size]
             histories = np.stack([crop_history(o, landmarks, image_size) for o in some])
@@ -230,7 +229,7 @@ def forecast_clip(
             forecast = predictor.predict(histories, shown, HORIZON)
             mouth = clip.motion.mouth
             result.append(forecast_metres(some, forecast.landmarks, landmarks, mouth, image_size))
-            bar.update(len(some))
+            bar.advance(len(some))
     ahead = np.concatenate(result)
     if not np.isfinite(ahead).all():
         raise RequestError(

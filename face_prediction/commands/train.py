@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from face_prediction.training.options import FaceTrainOptions
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
+from robo_manip_baselines.runs.threads import choose_waiting
 
 
 def run_train(options: FaceTrainOptions) -> int:
@@ -16,11 +18,12 @@ def run_train(options: FaceTrainOptions) -> int:
         RequestError: the dataset, the options or the folder cannot be used, or PyTorch is not
             installed.
     """
+    choose_waiting()
     try:
         from face_prediction.training.trainer import train_predictor  # not at the top: loads torch
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        install = "pip install 'robo_manip_baselines[face-prediction]'"
-        raise RequestError(f"training needs PyTorch; {install}") from None
+        install = install_command("face-prediction")
+        raise RequestError(f"training needs PyTorch; run: {install}") from None
     return train_predictor(options)

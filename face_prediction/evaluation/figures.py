@@ -21,6 +21,7 @@ from face_prediction.prediction.errors import mouth_distances
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.geometry import LIPS
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import atomic_file
 
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -46,8 +47,8 @@ def new_matplotlib_figure(width: float, height: float, layout: str | None = "con
         from matplotlib.figure import Figure
     except ImportError as error:
         raise RequestError(
-            f"figures need matplotlib ({error}); pip install "
-            "'robo_manip_baselines[face_prediction]', or give --no_figures"
+            f"figures need matplotlib ({error}); give --no_figures, or run: "
+            f"{install_command('face-prediction')}"
         ) from None
     figure = Figure(figsize=(width, height), dpi=100, layout=layout)  # pyright: ignore
     FigureCanvasAgg(figure)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.evaluation.predictors import Role, find_landmarks
@@ -19,6 +18,8 @@ from face_prediction.evaluation.setup import EvaluationSetup, SequenceSelection
 from face_prediction.prediction.errors import mouth_residuals, normalised_mean_errors
 from face_prediction.prediction.interface import Forecast, ImageNeeds
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
+from robo_manip_baselines.runs.progress import ProgressBar
 
 Floats = NDArray[np.float64]
 
@@ -54,8 +55,7 @@ def similarities(forecast: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Float
         from skimage.metrics import structural_similarity
     except ImportError as error:
         raise RequestError(
-            f"SSIM needs scikit-image ({error}); pip install "
-            "'robo_manip_baselines[face_prediction]'"
+            f"SSIM needs scikit-image ({error}); run: {install_command('face-prediction')}"
         ) from None
     wang = {"gaussian_weights": True, "sigma": SSIM_SIGMA, "use_sample_covariance": False}
     ours, true = forecast.astype(np.float32), truth.astype(np.float32)
@@ -192,14 +192,14 @@ def score_forecasts(setup: EvaluationSetup, progress: bool = False) -> Evaluatio
     needs = [needs for predictor in setup.predictors for needs in predictor.needs]
     needs += last_images.values()
     total = len(selection) * len(rows)
-    with tqdm(total=total, unit="forecast", leave=False, disable=not progress) as bar:
+    with ProgressBar(total, "forecast", shown=progress, keep=False) as bar:
         for places in selection.batches(BATCH):
             indices = selection.indices[places].tolist()
             batch = SequenceBatch(dataset, indices, needs, setup.sizes)
             for predictor, row in zip(setup.predictors, rows, strict=True):
                 forecast = predictor.forecast(selection.rows_at(places), batch)
                 _score(row, places, forecast, batch, setup.common_size)
-                bar.update(len(places))
+                bar.advance(len(places))
             for size, copied in copies.items():
                 last = batch.images(last_images[size])
                 assert last is not None
@@ -227,7 +227,7 @@ def score_shuffled_images(
     indices, networks = setup.selection.indices, setup.image_networks
     needs = [needs for network in networks for needs in network.needs]
     total = len(indices) * len(networks)
-    with tqdm(total=total, unit="forecast", leave=False, disable=not progress) as bar:
+    with ProgressBar(total, "forecast", shown=progress, keep=False) as bar:
         for places in setup.selection.batches(BATCH):
             own, images_of = indices[places].tolist(), indices[partners[places]].tolist()
             batch = SequenceBatch(setup.dataset, own, needs, images_of=images_of)
@@ -235,7 +235,7 @@ def score_shuffled_images(
                 forecast = network.forecast(setup.selection.rows_at(places), batch)
                 residuals = mouth_residuals(forecast.landmarks, batch.future)
                 scores.row(network.name).shuffled_residuals[places] = residuals
-                bar.update(len(places))
+                bar.advance(len(places))
 
 
 def _score(

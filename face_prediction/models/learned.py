@@ -27,6 +27,7 @@ from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs import tensors as tensor_files
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import atomic_file, read_json, write_json
 from robo_manip_baselines.runs.npz import parse_json
 from robo_manip_baselines.runs.tensors import require_alike, require_finite
@@ -35,7 +36,7 @@ try:
     import safetensors.torch
 except ModuleNotFoundError:
     raise RequestError(
-        "networks need safetensors; pip install 'robo_manip_baselines[face-prediction]'"
+        f"networks need safetensors; run: {install_command('face-prediction')}"
     ) from None
 
 KIND = {"schema": "face_predictor", "version": 1}

@@ -23,6 +23,7 @@ from face_prediction.tracking.geometry import (
 )
 from face_prediction.tracking.tracks import Size
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 
 CANONICAL_MEAN = np.array([0.0, -0.00676, 0.04159])
 """Mean of the 468 vertices of the canonical face that the head pose was fitted to (metres, head
@@ -240,7 +241,7 @@ def mediapipe_topology() -> Topology:
     except ImportError:
         raise RequestError(
             "export-surface takes the triangles from MediaPipe, which is not installed; "
-            "run: pip install 'robo_manip_baselines[face_prediction]'"
+            f"run: {install_command('face-prediction')}"
         ) from None
 
     def pairs(connections: Any) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 from face_prediction.tracking.geometry import CENTIMETRE
 from face_prediction.tracking.tracks import NUM_LANDMARKS, Size
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import atomic_file, file_digest
 
 logger = logging.getLogger(__name__)
@@ -144,8 +145,7 @@ class FaceDetector:
                 from mediapipe.tasks.python import BaseOptions, vision
         except ImportError as error:
             raise RequestError(
-                f"MediaPipe cannot be imported ({error}); "
-                "pip install 'robo_manip_baselines[face_prediction]'"
+                f"MediaPipe cannot be imported ({error}); run: {install_command('face-prediction')}"
             ) from None
         self._mediapipe: Any = mediapipe
         self._settings = settings

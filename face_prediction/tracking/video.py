@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from tqdm import tqdm
 
 from face_prediction.tracking.containers import missing_bytes
 from face_prediction.tracking.damage import DamageTracker
 from face_prediction.tracking.display import Display, NotShownError
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.progress import track
 
 if TYPE_CHECKING:
     import av
@@ -254,5 +254,4 @@ def with_bar(
     frames: Iterable[VideoFrame], total: int | None, label: str | None
 ) -> Iterable[VideoFrame]:
     """Pass on ``frames`` (``total``, if known) under a progress bar ``label``; None: no bar."""
-    disable = label is None
-    return tqdm(frames, total=total, desc=label, unit="frame", leave=False, disable=disable)
+    return track(frames, total, "frame", label or "", shown=label is not None, keep=False)

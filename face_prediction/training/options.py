@@ -23,8 +23,8 @@ from robo_manip_baselines.runs.errors import RequestError
 class FaceTrainOptions:
     """Train a network that predicts faces: a dataset in, a folder with its weights out.
 
-    The same command again carries on where training was stopped, or says that it is done. Options
-    that are None are the preset's.
+    The same command again carries on where training was stopped, or says that it is done; with more
+    --steps it extends a finished run. Options that are None are the preset's.
 
     Example: face-prediction train cross_attention --dataset face_dataset --preset cpu
 

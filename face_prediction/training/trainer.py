@@ -56,6 +56,8 @@ CURVES = {
     "error of the mouth centre, crops": ("mouth_error", "persistence_mouth_error"),
 }
 """Panels of ``curves.png``."""
+EXTENDABLE = "training.steps"
+"""The one setting that may differ when a run is carried on."""
 _VALIDATION_SHARE = 0.25  # of the memory for images, for the held-out fold
 
 logger = logging.getLogger(__name__)
@@ -99,7 +101,8 @@ def train_predictor(options: FaceTrainOptions) -> int:
         found = _previous_state(folder, record)
         if found and found[1].step == settings.steps:
             _require_result(folder, record, *found)
-            logger.info("%s: finished already, %d steps", folder, settings.steps)
+            done = folder, settings.steps
+            logger.info("%s: finished already, %d steps; a larger --steps extends it", *done)
             return 0
         stop = stack.enter_context(StopRequest())
         memory = options.memory_gb * 1e9
@@ -233,11 +236,18 @@ def _previous_state(
     tensors, state, _ = read_tensors(path)
     require_kind(path, state, KIND)
     for name, old, new in _differences(state["run"], _run_record(record)):
+        if name != EXTENDABLE:
+            raise RequestError(
+                f"--out {folder}: holds a run with {name} {old}, not {new}; "
+                "choose another folder, or give the same options"
+            )
+    progress = TrainerProgress(**state["progress"])
+    if progress.step > record.training["steps"]:
         raise RequestError(
-            f"--out {folder}: holds a run with {name} {old}, not {new}; "
-            "choose another folder, or give the same options"
+            f"--out {folder}: has done {progress.step} steps already, more than --steps "
+            f"{record.training['steps']}; give a larger number to extend the run"
         )
-    return tensors, TrainerProgress(**state["progress"])
+    return tensors, progress
 
 
 def _run_record(record: CheckpointRecord) -> dict[str, Any]:
@@ -353,7 +363,7 @@ class PredictorTrainer:
         options, settings, seed = self._options, self._settings, self._options.seed
         model, optimizer, progress = self._model, self._optimizer, self.progress
         done = (settings.steps, progress.step, progress.seconds)
-        bar = StepProgress(*done, shown=options.progress, log_every=options.log_every)
+        bar = StepProgress(*done, shown=options.progress)
         batches = window_batches(self._windows, settings, seed, progress.step)
         log = MetricsLog(options.folder / METRICS_FILE, progress.step, board=None)
         with bar, log, contextlib.closing(batches):

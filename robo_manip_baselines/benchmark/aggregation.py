@@ -102,9 +102,8 @@ def write_aggregation(
         "Demonstrations": f"{preset.demonstrations} of each expert, "
         + (f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"),
     }
-    if preset.caution:
-        facts["Caution"] = preset.caution
-    report = make_report(statistics, title=f"Benchmark {plan.env}", videos=clips, facts=facts)
+    title, caution = f"Benchmark {plan.env}", preset.caution
+    report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
     _keep_only(out / TABLES, write_tables(out / TABLES, report.tables))
     _keep_only(out / FIGURES, write_figures(out / FIGURES, report.figures))
     write_json(out / VERSIONS, item_versions())

@@ -25,6 +25,7 @@ from robo_manip_baselines.benchmark.work_item import (
 )
 from robo_manip_baselines.benchmark.worker import end_worker, last_line, start_worker
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 
 logger = logging.getLogger(__name__)
 
@@ -47,12 +48,14 @@ class RayExecutor:
     """
 
     def __init__(self, store: ArtifactStore, address: str | None) -> None:
+        place = "on this machine" if address is None else f"cluster at {address}"
+        logger.info("connecting to Ray: %s", place)
         try:
             import ray
             from ray import exceptions
         except ImportError as error:
             raise RequestError(
-                f"--executor ray needs Ray ({error}); pip install 'robo_manip_baselines[ray]'"
+                f"--executor ray needs Ray ({error}); run: {install_command('ray')}"
             ) from None
         self._ray, self._exceptions, self._store = ray, exceptions, store
         self._is_ours = not ray.is_initialized()

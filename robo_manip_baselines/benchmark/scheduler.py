@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -12,13 +11,11 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Protocol
 
-from tqdm import tqdm
-
 from robo_manip_baselines.benchmark.work_item import LOG, ArtifactStore, WorkItem
 from robo_manip_baselines.benchmark.worker import end_worker, last_line, start_worker
 from robo_manip_baselines.runs.command import EXIT_WRONG_REQUEST
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.progress import duration
+from robo_manip_baselines.runs.progress import ProgressBar, duration
 
 POLL = 0.05
 """s between checks of the processes."""
@@ -199,7 +196,7 @@ class GridProgress:
         workers: how many run at once.
         later: s of work that follows and is not planned yet.
         clock: current time, s.
-        bar: whether to draw a bar.
+        bar: whether to show it.
     """
 
     def __init__(
@@ -216,9 +213,8 @@ class GridProgress:
         self._seconds: dict[str, float] = {}
         self._ended: set[str] = set()
         self._started: dict[str, float] = {}
-        bar_format = "{percentage:3.0f}% |{bar}| {desc}"
-        self._bar = tqdm(total=1.0, bar_format=bar_format, disable=not bar)
-        self._shown = -1
+        form = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
+        self._bar = ProgressBar(1.0, "", shown=bar, form=form)
 
     def add(self, items: Iterable[WorkItem]) -> None:
         """Add the items that were to follow later."""
@@ -260,13 +256,17 @@ class GridProgress:
         return item.seconds * (fmean(ratios) if ratios else 1.0)
 
     def show(self) -> None:
-        """Draw the bar; where it cannot be redrawn, as in a log, only after an item has ended."""
-        if not self._bar.disable and (self._shown != len(self._ended) or sys.stderr.isatty()):
-            self._shown = len(self._ended)
-            count = f"{len(self._ended)} of {len(self._items)} items"
-            count += " before the videos" if self._later else ""
-            self._bar.n = self.fraction
-            self._bar.set_description_str(f"{count}, {duration(self.seconds_left)} left")
+        """Show the share of the work that is done, the time left, and what is being done.
+
+        Items differ a hundredfold in their work, and videos are planned last: their count is no
+        measure of it, and is not shown beside the share.
+        """
+        running = [str(self._items[key]) for key in self._started]
+        more = f" and {len(running) - 1} more" if len(running) > 1 else ""
+        now = [f"{running[0]}{more}"] if running else []
+        self._bar.note = ", ".join([f"about {duration(self.seconds_left)} left", *now])
+        self._bar.move_to(self.fraction)
+        self._bar.refresh()
 
     def close(self) -> None:
         """Draw the bar for the last time."""

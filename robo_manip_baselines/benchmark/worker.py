@@ -63,7 +63,7 @@ def start_worker(
     """
     # In a process of its own: the number of threads is fixed when PyTorch is imported.
     threads = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    environment = dict.fromkeys(threads, str(request["threads"])) | {"TQDM_DISABLE": "1"}
+    environment = dict.fromkeys(threads, str(request["threads"]))
     with (folder / LOG).open("ab") as log:
         process = subprocess.Popen(
             [

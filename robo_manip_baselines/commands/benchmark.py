@@ -204,6 +204,7 @@ def benchmark(options: BenchmarkOptions) -> int:
     if options.executor == "local":
         _require_device(options.preset, plan)
     prepare_folder(options.folder)
+    logger.info("%s, preset %s, in %s", options.benchmark, options.preset, options.folder)
     try:
         with closing(_executor(options, store)) as executor:
             carry_out(plan, items, store, executor, options)

@@ -208,7 +208,7 @@ def to_collection(options: RolloutOptions) -> Collection:
 
 
 def record(options: RolloutOptions) -> None:
-    """Record demonstrations, write their preview, and print the closing table.
+    """Record demonstrations, print the closing table, and write the preview.
 
     Raises:
         RequestError: the request cannot be met.
@@ -226,9 +226,6 @@ def record(options: RolloutOptions) -> None:
         shown = 0
     summary = collect(collection)
     episodes = list_episodes(collection.out)[:shown]
-    video = collection.out / PREVIEW if episodes else None
-    if video:
-        write_preview(video, episodes)
     rate = summary.steps_per_second
     rows = {
         "episodes": str(summary.episodes),
@@ -238,9 +235,12 @@ def record(options: RolloutOptions) -> None:
         "speed": "-" if rate is None else f"{rate:.0f} steps/s",
         "failed seeds": ", ".join(map(str, summary.failed_seeds)) or "-",
         "written to": str(collection.out),
-        "preview": str(video or "-"),
     }
-    print(closing_table(rows))  # noqa: T201
+    print(closing_table(rows), flush=True)  # noqa: T201
+    if episodes:
+        video = collection.out / PREVIEW
+        write_preview(video, episodes)
+        print(f"preview: {video}")  # noqa: T201
 
 
 # -- evaluation -----------------------------------------------------------------------------------

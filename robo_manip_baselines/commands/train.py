@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import logging
 import shlex
 from collections.abc import Mapping, Sequence
@@ -35,7 +36,7 @@ class TrainCommandOptions(Generic[Network]):
     corruption: bool = True
     """--no_corruption turns all corruption of the observations off."""
     resume: bool = False
-    """Continue the run in the run folder."""
+    """Continue the run in the run folder; with a larger --steps or --epochs, extend it."""
     config: Path | None = None
     """YAML file of options, such as the config.yaml of a run; the command line overrides it."""
 
@@ -167,6 +168,22 @@ def summary(config: TrainConfig[Any], first_step: int) -> str:
     return closing_table(rows)
 
 
+def require_run(folder: Path) -> None:
+    """Make sure that there is a run to resume, even one that has not saved a checkpoint yet.
+
+    Raises:
+        RequestError: naming the runs beside it whose names are most alike.
+    """
+    if list_checkpoints(folder) or (folder / CONFIG).is_file():
+        return
+    parent = folder.parent
+    there = sorted(path.parent.name for path in parent.glob(f"*/{CONFIG}"))
+    close = difflib.get_close_matches(folder.name, there, cutoff=0.0)
+    near = ", ".join(f"'{parent / name}'" for name in close)
+    hint = f"there are {near}" if near else f"no folder in '{parent}' does"
+    raise RequestError(f"--resume: '{folder}' holds no run; {hint}")
+
+
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Train.py``; return 0, or 130 after an interruption whose state is saved.
 
@@ -179,7 +196,9 @@ def main(args: Sequence[str]) -> int:
     from robo_manip_baselines.training.trainer import train
 
     before = list_checkpoints(config.folder)
-    code = train(config, resume="--resume" in args)
+    if is_resumed := "--resume" in args:
+        require_run(config.folder)
+    code = train(config, resume=is_resumed)
     if not Processes.from_environment().is_main:
         return code
     out = shlex.quote(str(config.folder))

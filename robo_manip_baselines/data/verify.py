@@ -12,7 +12,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from tqdm import tqdm
 
 from robo_manip_baselines.data.episode import (
     EpisodeFileError,
@@ -44,6 +43,7 @@ from robo_manip_baselines.runs.hdf5 import (
     require_own_links,
 )
 from robo_manip_baselines.runs.images import decode_image
+from robo_manip_baselines.runs.progress import track
 
 SHARED_ATTRIBUTES = (*POLICY_ATTRIBUTES, "env_kwargs", "cameras", "image_size")
 """Attributes that the episodes of a folder must share."""
@@ -66,7 +66,7 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
     problems: list[Problem] = []
     with ThreadPoolExecutor(max_workers=2) as pool:  # HDF5 is serial; decoding images is not
         found = pool.map(lambda path: verify_file(path, images=images), paths)
-        for of_one_file in tqdm(found, total=len(paths), unit="file", disable=None):
+        for of_one_file in track(found, len(paths), "file"):
             problems += of_one_file
     metadata = {path: _metadata(path) for path in paths}
     problems += _mixed(metadata) + _misplaced(metadata)

@@ -9,8 +9,8 @@ import logging
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -19,16 +19,17 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from robo_manip_baselines.data import (
     EpisodeReader,
     episode_path,
     finished_seeds,
+    list_episodes,
     read_metadata,
     remove_partial_episodes,
     write_episode,
 )
+from robo_manip_baselines.data.files import list_failures, seed_of
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
@@ -42,9 +43,13 @@ from robo_manip_baselines.rollout.results import completion_time, require_seeds
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, write_json
 from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_image
+from robo_manip_baselines.runs.progress import EpisodeProgress
 from robo_manip_baselines.runs.versions import software_versions
 
 SUMMARY = "summary.json"
+
+POLL = 0.2
+"""s between looks at the steps that worker processes have taken."""
 
 logger = logging.getLogger(__name__)
 
@@ -64,12 +69,18 @@ class Demonstration(NamedTuple):
 
 
 def demonstrate(
-    env: gymnasium.Env[Any, Any], expert: str, seed: int, *, codec: str, quality: int
+    env: gymnasium.Env[Any, Any],
+    expert: str,
+    seed: int,
+    *,
+    codec: str,
+    quality: int,
+    on_steps: Callable[[int], None] | None = None,
 ) -> Demonstration:
     """Let an expert, a name in the task's entry, act through one episode.
 
     The cameras of ``env``, made by `make_env`, are recorded; ``codec`` and ``quality`` are those of
-    `encode_image`.
+    `encode_image`. ``on_steps`` is called with 1 after every control step.
     """
     if env.spec is None:
         raise ValueError("the environment must be made by its id, so that it can be made again")
@@ -93,6 +104,8 @@ def demonstrate(
         rows["is_success"].append(info["is_success"])
         rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated
+        if on_steps:
+            on_steps(1)
     time = info["completion_time"]
     env_kwargs = dict(env.spec.kwargs)
     if env_kwargs.get("motion_library"):
@@ -166,9 +179,10 @@ class Collection:
 
 @dataclass(frozen=True)
 class CollectionSummary:
-    """Summary of a collection.
+    """Summary of all episodes of a folder, those of earlier calls included.
 
     Attributes:
+        first_seed: smallest seed.
         episodes: how many there are.
         successes, strict_successes: how many of them succeeded.
         failed_seeds: seeds that did not.
@@ -177,6 +191,7 @@ class CollectionSummary:
         steps_per_second: of this run, all workers together; None if nothing was left to do.
     """
 
+    first_seed: int
     episodes: int
     successes: int
     strict_successes: int
@@ -208,17 +223,17 @@ def collect(collection: Collection) -> CollectionSummary:
             total = len(collection.seeds)
             logger.info("%d of %d episodes are there already", total - len(todo), total)
         steps, begin = 0, time.perf_counter()
-        with tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress:
-            for count in _record_all(collection, env, todo):
+        longest = task_entry(collection.env).max_episode_steps
+        with EpisodeProgress(len(todo), longest, collection.expert) as progress:
+            for count in _record_all(collection, env, todo, progress.step):
                 steps += count
-                progress.update()
+                progress.end(count)
         elapsed = time.perf_counter() - begin
-    summary = _summarize(collection, steps, steps / elapsed if todo else None)
+    summary = _summarize(collection.out, steps, steps / elapsed if todo else None)
     content = {
         "env": task_entry(collection.env).env_id,
         "env_kwargs": collection.env_kwargs,
         "expert": collection.expert,
-        "first_seed": collection.seeds.start,
         "workers": collection.workers,
         **asdict(summary),
     }
@@ -226,44 +241,62 @@ def collect(collection: Collection) -> CollectionSummary:
     return summary
 
 
-def _summarize(
-    collection: Collection, steps: int, steps_per_second: float | None
-) -> CollectionSummary:
-    """Summarize the files of a collection."""
-    paths = {seed: collection.path(seed) for seed in collection.seeds}
-    outcomes = {seed: read_metadata(path) for seed, path in paths.items() if path}
+def _summarize(folder: Path, steps: int, steps_per_second: float | None) -> CollectionSummary:
+    """Summarize all episodes of a folder."""
+    paths = {seed_of(path): path for path in list_episodes(folder) + list_failures(folder)}
+    seeds = sorted(seed for seed in paths if seed is not None)
+    outcomes = {seed: read_metadata(paths[seed]) for seed in seeds}
     times = [o["completion_time"] for o in outcomes.values() if o["is_success"]]
     mean, sd = completion_time(times)
     strict = sum(bool(o["is_success_strict"]) for o in outcomes.values())
     failed = [seed for seed, o in outcomes.items() if not o["is_success"]]
     return CollectionSummary(
-        len(outcomes), len(times), strict, failed, mean, sd, steps, steps_per_second
+        min(outcomes), len(outcomes), len(times), strict, failed, mean, sd, steps, steps_per_second
     )
 
 
 def _record_all(
-    collection: Collection, env: gymnasium.Env[Any, Any], seeds: list[int]
+    collection: Collection,
+    env: gymnasium.Env[Any, Any],
+    seeds: list[int],
+    on_steps: Callable[[int], None],
 ) -> Iterator[int]:
-    """Record seeds, here or in worker processes; yield the steps of each as it is finished."""
+    """Record seeds, here or in worker processes; yield the steps of each as it is finished.
+
+    ``on_steps`` is called with the number of steps taken since its last call.
+    """
     workers = min(collection.workers, len(seeds))
     if workers <= 1:
         for seed in seeds:
-            yield _record(collection, env, seed)
+            yield _record(collection, env, seed, on_steps)
         return
+    logger.info("starting %d worker processes", workers)
     # Spawned, not forked: an OpenGL context does not survive a fork.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (collection,))
+    context = get_context("spawn")
+    counter, seen = context.Value("q", 0), 0
+    pool = ProcessPoolExecutor(workers, context, _start_worker, (collection, counter))
     try:
-        futures = [pool.submit(_record_in_worker, seed) for seed in seeds]
-        for future in as_completed(futures):
-            yield future.result()
+        waiting = {pool.submit(_record_in_worker, seed) for seed in seeds}
+        while waiting:
+            ended, waiting = wait(waiting, POLL, FIRST_COMPLETED)
+            taken = counter.value
+            on_steps(taken - seen)
+            seen = taken
+            for future in ended:
+                yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> int:
+def _record(
+    collection: Collection,
+    env: gymnasium.Env[Any, Any],
+    seed: int,
+    on_steps: Callable[[int], None],
+) -> int:
     """Record one episode into its file; return its number of steps."""
-    codec, quality = collection.codec, collection.quality
-    demonstration = demonstrate(env, collection.expert, seed, codec=codec, quality=quality)
+    images: Any = {"codec": collection.codec, "quality": collection.quality}
+    demonstration = demonstrate(env, collection.expert, seed, **images, on_steps=on_steps)
     path = episode_path(collection.out, seed, demonstration.attributes["is_success"])
     write_episode(path, *demonstration)
     return len(demonstration.arrays["time"])
@@ -273,16 +306,20 @@ _worker: dict[str, Any] = {}
 """State of a worker process between episodes; empty in every other process."""
 
 
-def _start_worker(collection: Collection) -> None:
+def _start_worker(collection: Collection, counter: Any) -> None:
     # Ctrl-C reaches the whole process group: workers stop at once, the parent does the talking.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     env = make_env(collection.env, **collection.env_kwargs)
     atexit.register(env.close)
-    _worker.update(collection=collection, env=env)
+    _worker.update(collection=collection, env=env, counter=counter)
 
 
 def _record_in_worker(seed: int) -> int:
-    return _record(_worker["collection"], _worker["env"], seed)
+    def count_steps(count: int) -> None:
+        with _worker["counter"].get_lock():
+            _worker["counter"].value += count
+
+    return _record(_worker["collection"], _worker["env"], seed, count_steps)
 
 
 def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:

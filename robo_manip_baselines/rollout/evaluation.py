@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
-
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, pin_library
@@ -35,6 +33,7 @@ from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_json
+from robo_manip_baselines.runs.progress import EpisodeProgress
 from robo_manip_baselines.runs.versions import software_versions
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
@@ -245,7 +244,7 @@ class EvaluationPlan:
         if not seeds:
             return
         checkpoint, successes = self.checkpoint, 0
-        num_envs = min(self.config.num_envs, len(seeds))
+        num_envs, longest = min(self.config.num_envs, len(seeds)), self.env.task.max_episode_steps
         origin: dict[str, Any] = {
             "policy": checkpoint.policy,
             "condition": self.condition,
@@ -258,17 +257,18 @@ class EvaluationPlan:
         with (
             self._one_thread_if_small(),
             open_envs(self.env, num_envs, self.config.workers) as envs,
-            tqdm(total=len(seeds), unit="episode", desc=checkpoint.policy) as progress,
+            EpisodeProgress(len(seeds), longest, checkpoint.policy) as progress,
         ):
 
             def finished(result: EpisodeResult, recording: Recording) -> None:
                 nonlocal successes
                 successes += result.is_success
                 on_episode(replace(result, **origin), recording)
-                progress.set_postfix_str(f"{successes} succeeded", refresh=False)
-                progress.update()
+                progress.note = f"{successes} succeeded"
+                progress.end(result.steps)
 
-            rollout(self.make_policy(num_envs), envs, seeds, on_episode=finished)
+            policy = self.make_policy(num_envs)
+            rollout(policy, envs, seeds, on_episode=finished, on_steps=progress.step)
 
     @contextlib.contextmanager
     def _one_thread_if_small(self) -> Iterator[None]:
@@ -326,8 +326,13 @@ def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummar
         plan.run(todo, on_episode)
         seconds = time.perf_counter() - begin
         results = file.of(seeds)
-    summary = summarize(plan.env.task, results, new=len(todo), seconds=seconds)
-    write_json(plan.out / SUMMARY, {**plan.facts, **asdict(summary)})
+        everything = file.of(sorted(file.done))
+    # Of all rows of the folder: a table of results.jsonl has the same numbers.
+    summary = summarize(plan.env.task, everything, new=len(todo), seconds=seconds)
+    facts = {**plan.facts, "first_seed": everything[0].seed}
+    write_json(plan.out / SUMMARY, {**facts, **asdict(summary)})
+    if len(everything) > len(results):
+        logger.info("the summary is over all %d episodes of %s", len(everything), plan.out)
 
     videos = {plan.out / VIDEOS / video_name(r): r for r in pick_for_video(results, number)}
     missing = {path: result for path, result in videos.items() if not path.exists()}

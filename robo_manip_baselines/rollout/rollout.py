@@ -62,6 +62,7 @@ def rollout(
     seeds: Sequence[int],
     *,
     on_episode: Callable[[EpisodeResult, Recording], None] | None = None,
+    on_steps: Callable[[int], None] | None = None,
 ) -> list[EpisodeResult]:
     """Let a policy act through one episode for each seed.
 
@@ -74,6 +75,7 @@ def rollout(
         envs: from ``open_envs``.
         seeds: of the episodes, none of them twice; the results are in their order.
         on_episode: called with every episode that has ended, in the order in which they end.
+        on_steps: called with the number of control steps that are taken, all episodes together.
 
     Raises:
         ValueError: a seed is there twice.
@@ -112,6 +114,8 @@ def rollout(
         for number, vector, action in zip(numbers, vectors, actions, strict=True):
             recordings[number].vectors.append(vector)
             recordings[number].actions.append(action)
+        if on_steps:
+            on_steps(len(numbers))
         return request(numbers, [None] * len(numbers))
 
     requests, running = start(range(len(arrays))), 0

@@ -5,18 +5,20 @@ Images are RGB, (H, W, 3) uint8; drawing functions return a new image and leave 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import av
 import cv2
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from robo_manip_baselines.data import EpisodeReader, read_metadata
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
@@ -27,8 +29,12 @@ from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
 from robo_manip_baselines.rollout.workers import EnvConfig
 from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.images import decode_image
+from robo_manip_baselines.runs.progress import track
 
 Colour = tuple[int, int, int]
+Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 YELLOW: Colour = (255, 214, 10)
 CYAN: Colour = (0, 229, 255)
@@ -46,8 +52,14 @@ TRACK_STEPS = 100
 VIEW_SIZE = (360, 480)
 """Height and width of each camera's view in pixels: three of them fit a screen."""
 
+PLAIN = {"image_size": VIEW_SIZE}
+"""Arguments of an environment whose images are for a preview: they look as recorded ones."""
+
 LOOK = {"image_size": VIEW_SIZE, "shadows": True, "multisamples": 4}
 """Arguments of an environment whose images are for people."""
+
+THREADS = 2
+"""Threads that draw frames while others are rendered and encoded."""
 
 CLOSE_UP = "front_close"
 ZOOM = 3
@@ -68,13 +80,16 @@ class VideoWriter:
         path: file to write, ``….mp4``.
         fps: frames a second.
         crf: quality of libx264, 0 (lossless) to 51; 20 shows no blocks in rendered scenes.
+        preset: of libx264: slower ones make smaller files.
     """
 
-    def __init__(self, path: str | Path, fps: float, *, crf: int = 20) -> None:
+    def __init__(
+        self, path: str | Path, fps: float, *, crf: int = 20, preset: str = "veryfast"
+    ) -> None:
         if fps <= 0:
             raise ValueError(f"a video needs a positive number of frames a second, not {fps}")
         self._shape: tuple[int, ...] | None = None
-        self._file = self._open(Path(path), Fraction(fps).limit_denominator(1001), crf)
+        self._file = self._open(Path(path), Fraction(fps).limit_denominator(1001), crf, preset)
 
     def __enter__(self) -> VideoWriter:
         self._file.__enter__()
@@ -84,7 +99,7 @@ class VideoWriter:
         self._file.__exit__(*error)
 
     @contextmanager
-    def _open(self, path: Path, rate: Fraction, crf: int) -> Iterator[None]:
+    def _open(self, path: Path, rate: Fraction, crf: int, preset: str) -> Iterator[None]:
         # The index goes to the front so that a browser starts to play before all has arrived.
         options = {"movflags": "+faststart"}
         with (
@@ -93,7 +108,7 @@ class VideoWriter:
         ):
             self._stream = self._container.add_stream("libx264", rate=rate)
             self._stream.pix_fmt = "yuv420p"
-            self._stream.options = {"crf": str(crf), "preset": "medium"}
+            self._stream.options = {"crf": str(crf), "preset": preset}
             self._stream.codec_context.thread_count = 1  # the same bytes on any number of cores
             yield
             if self._shape is None:
@@ -162,10 +177,13 @@ def draw_track(
     valid = np.isfinite(points).all(axis=1) & (np.abs(points) < limit).all(axis=1)
     fixed = np.round(np.where(valid[:, None], points, 0) * 16).astype(int)  # 1/16 pixel
     opacity = np.zeros(image.shape[:2], dtype=np.uint8)
+    # From the past to the present: a brighter piece covers a fainter one, and none adds to another.
+    places = fixed.tolist()
     for index in range(1, len(points)):
         if valid[index - 1] and valid[index]:
             value = round(255 * (0.15 + 0.85 * index / (len(points) - 1)))
-            _add_line(opacity, fixed[index - 1], fixed[index], thickness, value)
+            ends = places[index - 1], places[index]
+            cv2.line(opacity, *ends, value, thickness, cv2.LINE_AA, shift=4)
     drawn = _paint(image, opacity, colour)
     if len(points) and valid[-1]:
         centre = fixed[-1].tolist()
@@ -201,22 +219,6 @@ def _paint(image: np.ndarray, opacity: np.ndarray, colour: Colour) -> np.ndarray
     return painted
 
 
-def _add_line(
-    opacity: np.ndarray, start: np.ndarray, end: np.ndarray, thickness: int, value: int
-) -> None:
-    """Raise ``opacity`` to ``value`` along a line given in 1/16 pixels; crossings do not add."""
-    height, width = opacity.shape
-    low = np.maximum(np.minimum(start, end) // 16 - thickness - 2, 0)
-    high = np.minimum(np.maximum(start, end) // 16 + thickness + 3, (width, height))
-    if (high <= low).any():
-        return
-    region = opacity[low[1] : high[1], low[0] : high[0]]
-    line = np.zeros_like(region)
-    first, last = (start - low * 16).tolist(), (end - low * 16).tolist()
-    cv2.line(line, first, last, value, thickness, cv2.LINE_AA, shift=4)
-    np.maximum(region, line, out=region)
-
-
 def write_preview(path: Path, episodes: Sequence[Path]) -> None:
     """Write one H.264 video of some episodes, one after the other, with a progress bar.
 
@@ -230,24 +232,84 @@ def write_preview(path: Path, episodes: Sequence[Path]) -> None:
 
 def _write_frames(path: Path, frames: Iterable[np.ndarray], total: int) -> None:
     with VideoWriter(path, FPS) as video:
-        for frame in tqdm(frames, path.name, total, unit="frame", mininterval=1.0):
+        for frame in track(frames, total, "frame", path.name):
             video.write(frame)
 
 
 def preview_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
-    """Replay an episode and draw it; yield (H, 3 W, 3) uint8 frames."""
-    with EpisodeReader(path) as episode, closing(remake_env(episode, cameras=(), **LOOK)) as env:
+    """Draw an episode; yield (H, W, 3) uint8 frames, the cameras side by side.
+
+    The recorded images are shown where all cameras were recorded at the size of the views or
+    larger. Otherwise the episode is replayed and rendered, without shadows, as images are recorded:
+    those take five times as long.
+    """
+    with EpisodeReader(path) as episode, closing(remake_env(episode, cameras=(), **PLAIN)) as env:
         world = world_of(env)
+        env.reset(seed=int(episode.attributes["seed"]))
+        recorded = episode.attributes["image_size"]
+        is_recorded = set(CAMERAS) <= set(episode.attributes["cameras"])
+        is_recorded = is_recorded and recorded[0] >= VIEW_SIZE[0]
+        height, width = VIEW_SIZE
+        if is_recorded:
+            width = round(recorded[1] * height / recorded[0])
         target = episode.array(world.task.target_field)[:, 0]
+        # The cameras stand still.
+        lines = {c: project(world.model, world.data, c, target, (height, width)) for c in CAMERAS}
         names, phases = episode.attributes["phase_names"], episode.array("phase")
         title = f"seed {episode.attributes['seed']}, {episode.attributes['expert']}"
-        for step in replay(env, episode):
-            if step % FRAME_STEPS == 0:
-                views = world.renderer.render(world.data, CAMERAS)
-                past = target[max(0, step - TRACK_STEPS) : step + 1]
-                drawn = [draw_track(views[c], _pixels(world, c, past)) for c in CAMERAS]
-                caption = f"{title}: {names[phases[step]]}, {step * CONTROL_PERIOD:.1f} s"
-                yield side_by_side([put_caption(drawn[0], caption), *drawn[1:]])
+
+        def draw(shown: tuple[int, dict[str, NDArray[np.uint8]]]) -> NDArray[np.uint8]:
+            step, views = shown
+            past = slice(max(0, step - TRACK_STEPS), step + 1)
+            caption = f"{title}: {names[phases[step]]}, {step * CONTROL_PERIOD:.1f} s"
+            drawn = []
+            for camera in CAMERAS:
+                view = views[camera]
+                if is_recorded:
+                    view = _resized(decode_image(view), height, width)
+                drawn.append(draw_track(view, lines[camera][past]))
+            return side_by_side([put_caption(drawn[0], caption), *drawn[1:]])
+
+        views = _recorded_views(episode) if is_recorded else _rendered_views(env, episode)
+        yield from _in_threads(draw, views)
+
+
+def _recorded_views(
+    episode: EpisodeReader,
+) -> Iterator[tuple[int, dict[str, NDArray[np.uint8]]]]:
+    """Yield the steps to show with their encoded images, by camera."""
+    for step in range(0, len(episode), FRAME_STEPS):
+        yield step, {camera: episode.encoded_frame(camera, step) for camera in CAMERAS}
+
+
+def _rendered_views(
+    env: gymnasium.Env[Any, Any], episode: EpisodeReader
+) -> Iterator[tuple[int, dict[str, NDArray[np.uint8]]]]:
+    """Replay an episode; yield the steps to show with their images, by camera."""
+    world = world_of(env)
+    for step in replay(env, episode):
+        if step % FRAME_STEPS == 0:
+            yield step, world.renderer.render(world.data, CAMERAS)
+
+
+def _resized(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _in_threads(function: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
+    """Yield what a function makes of items, in their order, a few items ahead of the reader.
+
+    Items are taken in the reader's thread, which owns the OpenGL context; OpenCV and the encoder
+    let other threads run meanwhile.
+    """
+    with ThreadPoolExecutor(THREADS, thread_name_prefix="frames") as pool:
+        ahead: deque[Future[Made]] = deque()
+        for item in items:
+            ahead.append(pool.submit(function, item))
+            if len(ahead) > 2 * THREADS:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
 
 
 def pick_for_video(results: Sequence[EpisodeResult], number: int) -> list[EpisodeResult]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.extras import pip_install
 from robo_manip_baselines.runs.files import atomic_file, write_text
 
 LOGGERS = ("tensorboard", "wandb", "none")
@@ -102,8 +103,8 @@ def open_board(logger: str, folder: Path, step: int, config: Mapping[str, Any]) 
             return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
         return _Wandb(folder, config)
     except ImportError as error:
-        remedy = f"pip install {logger}, or say --logger none"
-        raise RequestError(f"{logger} is not installed: {remedy}") from error
+        remedy = f"say --logger none, or run: {pip_install(logger)}"
+        raise RequestError(f"{logger} is not installed; {remedy}") from error
 
 
 class _Wandb:

@@ -7,7 +7,7 @@ as in every release.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -38,6 +38,9 @@ RUNTIME_OPTIONS = frozenset(
     {"device", "logger", "dataset", "out", "log_every", "validate_every", "checkpoint_every"}
 )
 """Options that may change when a run is resumed: they do not decide the weights."""
+
+BUDGET_OPTIONS = frozenset({"steps", "epochs"})
+"""Options that may also change when a run is resumed, to extend it."""
 
 _PARTS = ("network", "training", "spec")
 """Attributes of the configuration whose fields are options."""
@@ -202,8 +205,10 @@ def write_config(run: Path, config: TrainConfig[Any]) -> None:
     write_text(run / CONFIG, yaml.safe_dump(values, sort_keys=False, allow_unicode=True))
 
 
-def require_same_config(run: Path, config: TrainConfig[Any]) -> None:
-    """Make sure that a run folder's options are those of ``config``, runtime options apart.
+def require_same_config(
+    run: Path, config: TrainConfig[Any], may_differ: Set[str] = RUNTIME_OPTIONS
+) -> None:
+    """Make sure that a run folder's options are those of ``config``, apart from ``may_differ``.
 
     Raises:
         RequestError: naming the first option that differs.
@@ -214,12 +219,13 @@ def require_same_config(run: Path, config: TrainConfig[Any]) -> None:
     except RequestError as error:
         raise RequestError(f"'{run / CONFIG}': {error}; choose another --out") from error
     for name, value in config.to_json().items():
-        if name not in RUNTIME_OPTIONS and value != before.get(name):
+        if name not in may_differ and value != before.get(name):
             pair = before[name], value
             old, new = (" ".join(map(str, v)) if isinstance(v, list) else v for v in pair)
+            extends = "--resume extends it, " if name in BUDGET_OPTIONS else ""
             raise RequestError(
                 f"'{run}' holds a run with {name} {old}, not {new}; "
-                "choose another --out, or give the same options"
+                f"{extends}choose another --out, or give the same options"
             )
 
 

@@ -16,12 +16,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.episode import EpisodeFileError, EpisodeReader
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import decode_image
+from robo_manip_baselines.runs.progress import track
 
 Images = NDArray[np.uint8]
 
@@ -143,7 +143,7 @@ class ImageStore(AbstractContextManager["ImageStore"]):
 
         numbers = range(len(self._paths))
         done = self._pool.map(decode_episode, numbers)
-        for _ in tqdm(done, "decoding images", len(numbers), unit="episode", disable=None):
+        for _ in track(done, len(numbers), "episode", "decoding images"):
             pass
         return held
 

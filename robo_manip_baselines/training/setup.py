@@ -31,9 +31,12 @@ from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.runs.versions import software_versions
 from robo_manip_baselines.training.batching import ExampleSampler
 from robo_manip_baselines.training.config import (
+    BUDGET_OPTIONS,
     CONFIG,
     METRICS,
+    RUNTIME_OPTIONS,
     TrainConfig,
+    read_config,
     require_same_config,
     write_config,
 )
@@ -137,11 +140,17 @@ class TrainSetup:
         run = self.config.folder
         if not list_checkpoints(run):
             return None
-        require_same_config(run, self.config)
+        extendable = RUNTIME_OPTIONS | BUDGET_OPTIONS
+        require_same_config(run, self.config, extendable if resume else RUNTIME_OPTIONS)
         checkpoint = read_checkpoint(run)
+        if resume and checkpoint.step > self.total_steps:
+            raise RequestError(
+                f"'{run}' has done {checkpoint.step} steps already, more than {self.total_steps}; "
+                "give a larger --steps or --epochs to extend the run"
+            )
         if not resume:
             done = checkpoint.step >= self.total_steps
-            state = "finished; choose another --out or --seed"
+            state = "finished; choose another --out or --seed, or --resume with more --steps"
             if not done:
                 state = f"at step {checkpoint.step}; --resume continues it"
             raise RequestError(f"'{run}' holds this run, {state}")
@@ -171,6 +180,8 @@ class TrainSetup:
             write_config(run, config)
         elif not (run / CONFIG).is_file():
             raise RequestError(f"'{run}' has lost its {CONFIG}; choose another --out")
+        elif TrainConfig.from_json(read_config(run / CONFIG)).training != config.training:
+            write_config(run, config)  # the run is extended
         step = start.step if start else 0
         board = open_board(config.logger, run, step, config.to_json())
         return MetricsLog(run / METRICS, step, board)

@@ -19,6 +19,7 @@ from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.checkpoints import prune_checkpoints, step_folder
 from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import pip_install
 from robo_manip_baselines.runs.files import locked
 from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
@@ -85,7 +86,8 @@ def _train(
             stack.enter_context(locked(config.folder))
         start = setup.find_start(resume)
         if start and start.step >= setup.total_steps:
-            logger.info("%s is finished: %d steps", config.folder, start.step)
+            done = config.folder, start.step
+            logger.info("%s is finished: %d steps; a larger --steps extends it", *done)
         else:
             processes.wait()  # until every process has seen the folder as it was
             log = stack.enter_context(setup.open_log(start)) if processes.is_main else None
@@ -103,7 +105,7 @@ def _train(
             if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
                 logger.info("curves: %s", run / CURVES)
             else:
-                logger.info("no image of the curves: pip install matplotlib")
+                logger.info("no image of the curves; run: %s", pip_install("matplotlib"))
     return 0
 
 
@@ -147,7 +149,7 @@ class Trainer:
         seconds = self.state.restore(start) if start else 0.0
         self._saved_step = start.step if start else 0
         done = setup.total_steps, self._saved_step, seconds
-        self._progress = StepProgress(*done, shown=processes.is_main, log_every=config.log_every)
+        self._progress = StepProgress(*done, shown=processes.is_main)
         self._timer = StepTimer(device)
         loss: nn.Module = _LossModule(model)
         if processes.world_size > 1:

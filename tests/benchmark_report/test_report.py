@@ -217,7 +217,7 @@ def test_facts_of_the_study(statistics: BenchmarkStatistics) -> None:
     assert general_facts(statistics) == {
         "Environment": "FeedingEnv",
         "Episodes": "3200 of 16 conditions",
-        "Training seeds": "0, 1",
+        "Training runs": "2 of each condition (seeds 0, 1)",
         "Evaluation seeds": "100 that all conditions have, from 1000 to 1099",
         "Recorded motion": "7 clips of 5 people",
         "Versions": "numpy 2",

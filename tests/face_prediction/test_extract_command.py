@@ -317,7 +317,7 @@ def test_video_mode_and_zoom_exclude_one_another(model: Path, caplog, exit_code)
 
 def test_without_mediapipe_the_extra_is_named(model: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "mediapipe", None)
-    with pytest.raises(RequestError, match=r"pip install 'robo_manip_baselines\[face_prediction\]"):
+    with pytest.raises(RequestError, match=r"pip install .*\[face-prediction\]'"):
         FaceDetector(model, DetectorSettings())
 
 

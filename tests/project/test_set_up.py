@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -104,6 +105,42 @@ def test_installed_is_installed(bare_tree: Path) -> None:
     assert len(log.read_text().splitlines()) == 2
 
 
+PIP_SAYS = """Obtaining file:///x
+  Installing build dependencies: started
+Collecting av>=14.0 (from robo_manip_baselines==0.1.0)
+  Downloading av-14.0.0-cp311-cp311-manylinux.whl.metadata (4.7 kB)
+Collecting torch>=2.6
+Downloading av-14.0.0-cp311-cp311-manylinux_2_28_x86_64.whl (9.9 MB)
+Downloading https://pytorch.org/whl/torch-2.13.0-cp311-cp311-linux_x86_64.whl (190.4 MB)
+Downloading nvidia_cublas-12.8-py3-none-manylinux_2_27_x86_64.whl (1.2 GB)
+Installing collected packages: av, torch, nvidia_cublas
+Successfully installed av torch nvidia_cublas
+"""
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_an_install_is_not_silent(bare_tree: Path, code: int) -> None:
+    """A line for each stage, with the time; all that pip says only where it fails."""
+    venv = bare_tree / ".venv" / "bin"
+    venv.mkdir(parents=True)
+    (bare_tree / "says").write_text(PIP_SAYS)
+    python = venv / "python"
+    script = f"[ $1 = -c ] && echo 3.11 && exit 0\ncat {bare_tree / 'says'}; exit {code}\n"
+    python.write_text(f"#!/bin/sh\n{script}", encoding="utf-8")
+    python.chmod(0o755)
+    result = set_up(bare_tree)
+    assert result.returncode == code
+    lines = [re.sub(r"\b\d+ s\b", "N s", line) for line in result.stdout.splitlines()]
+    assert lines[1:5] == [
+        "set-up: N s: looking up packages",
+        "set-up: N s: downloading torch-2.13.0-cp311-cp311-linux_x86_64.whl (190.4 MB)",
+        "set-up: N s: downloading nvidia_cublas-12.8-py3-none-manylinux_2_27_x86_64.whl (1.2 GB)",
+        "set-up: N s: installing 3 packages",
+    ]
+    assert lines[5:] == ([] if code else ["set-up: installed after N s"])
+    assert ("Successfully installed" in result.stderr) == bool(code)
+
+
 def test_help_lists_the_targets(repository: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
     listing = subprocess.run(
@@ -165,6 +202,52 @@ def test_opengl_check_prints_the_apt_line_when_it_may_not_install(
     assert "no libEGL" in message
     assert "run: sudo apt-get update && sudo apt-get install -y" in message
     assert "libegl1" in message
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"MUJOCO_EGL_DEVICE_ID": "99"}, "MUJOCO_EGL_DEVICE_ID=99: there is no such EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": "-1"}, "MUJOCO_EGL_DEVICE_ID=-1: there is no such EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": "gpu"}, "='gpu': must be the number of an EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": ""}, "='': must be the number of an EGL device"),
+        ({"MUJOCO_EGL_DEVICE_ID": "1"}, r"=1: this EGL device cannot draw \[it broke\]"),
+        ({"PYOPENGL_PLATFORM": "glx"}, "PYOPENGL_PLATFORM=glx: does not go with MUJOCO_GL=egl"),
+        ({"MUJOCO_GL": "glfw", "DISPLAY": ""}, "needs a display"),
+    ],
+)
+def test_a_wrong_variable_is_no_missing_library(
+    variables: dict[str, str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(opengl_check, "_count_egl_devices", lambda: 3)
+    line = opengl_check.explain_failure(opengl_check.backend_in_use(), "it broke")
+    assert re.search(message, line)
+    assert "apt-get" not in line
+    if "MUJOCO_EGL_DEVICE_ID" in variables:
+        assert "there are 3, valid: 0 to 2, or unset it" in line
+
+
+@pytest.mark.gl
+def test_opengl_check_knows_how_many_devices_there_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "4096")
+    assert opengl_check.main(["--install"]) == 2
+    message = capsys.readouterr().err
+    assert re.search(r"=4096: there is no such EGL device; there (is|are) \d+, valid: 0", message)
+    assert message.count("\n") == 1
+
+
+def test_without_egl_the_library_is_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "0")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    monkeypatch.setattr(opengl_check, "_count_egl_devices", lambda: 0)
+    assert "apt-get install" in opengl_check.explain_failure("egl", "no libEGL")
 
 
 def test_opengl_check_installs_at_once_when_root(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from robo_manip_baselines.commands.train import main as train
 from robo_manip_baselines.commands.train import parse_config
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
+from robo_manip_baselines.runs import threads
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import read_metrics
@@ -163,6 +165,41 @@ def test_what_a_run_folder_holds_is_respected(
     assert weights(run) == before
 
 
+def test_a_finished_run_is_extended_from_its_folder(line: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert train(f"Mlp {line} --steps 4".split()) == 0
+    with pytest.raises(RequestError, match="with steps 4, not 6; --resume extends it"):
+        train(f"Mlp {line} --steps 6".split())
+    assert train(f"Mlp --out {run} --resume --steps 6".split()) == 0
+    assert read_checkpoint(run).step == 6
+    assert train(f"Mlp --out {run} --resume".split()) == 0  # the new budget is the run's own
+
+
+@pytest.mark.parametrize("folder", ["act_currnet", "new/act_current", "."])
+def test_a_mistyped_folder_is_not_a_new_run(line: str, folder: str, tmp_path: Path) -> None:
+    for name in ("act_current", "act_baseline", "notes"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / ("notes.txt" if name == "notes" else "config.yaml")).touch()
+    before = sorted(tmp_path.rglob("*"))
+    given = tmp_path / folder
+    with pytest.raises(RequestError, match=r"--resume: '.*' holds no run; ") as refusal:
+        train(f"Mlp {line} --resume --out {given}".split())
+    if folder == "act_currnet":
+        near = f"there are '{tmp_path / 'act_current'}', '{tmp_path / 'act_baseline'}'"
+        assert near in str(refusal.value)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_run_without_a_checkpoint_yet_is_resumed_from_its_start(
+    line: str, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    train(f"Mlp {line} --steps 2".split())
+    shutil.rmtree(run / "checkpoints")
+    assert train(f"Mlp --out {run} --resume".split()) == 0
+    assert read_checkpoint(run).step == 2
+
+
 def test_an_unfinished_run_needs_resume(line: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(f"Mlp {line} --steps 4 --checkpoint_every 2".split())
@@ -221,12 +258,63 @@ def test_devices_that_are_not_there(device: str, message: str, line: str) -> Non
         train(f"Mlp {line} --device {device}".split())
 
 
+def write_stat(path: Path, ticks: dict[int, tuple[int, int]]) -> None:
+    """Write a file like /proc/stat: (busy, idle) of each core."""
+    rows = [f"cpu{core} {busy} 0 0 {idle} 0 0 0 0 0 0" for core, (busy, idle) in ticks.items()]
+    path.write_text("\n".join(["cpu  1 2 3 4 5 6 7 8 9 10", *rows, "intr 7", "ctxt 8"]))
+
+
+@pytest.mark.parametrize(
+    ("later", "taken"),
+    [
+        ({0: (100, 110), 1: (100, 110)}, 0),
+        ({0: (110, 100), 1: (101, 109)}, 1),
+        ({0: (110, 100), 1: (109, 101)}, 2),
+        ({0: (110, 100), 1: (100, 110), 7: (900, 0)}, 1),  # a core that this process may not use
+        ({0: (100, 100), 1: (100, 100)}, 0),  # no time has passed
+    ],
+)
+def test_cores_that_others_keep_busy_are_counted(
+    later: dict[int, tuple[int, int]], taken: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stat = tmp_path / "stat"
+    write_stat(stat, {0: (100, 100), 1: (100, 100), 7: (0, 0)})
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(threads.time, "sleep", lambda _: write_stat(stat, later))
+    assert threads.taken_cores(stat) == taken
+
+
+@pytest.mark.parametrize("content", [None, "", "cpu0 x y z", "cpu0 1"])
+def test_without_a_load_no_core_is_taken(content: str | None, tmp_path: Path) -> None:
+    stat = tmp_path / "stat"
+    if content is not None:
+        stat.write_text(content)
+    assert threads.taken_cores(stat) == 0
+
+
+@pytest.mark.parametrize(("taken", "spins"), [(0, "3000"), (1, "0")])
+def test_threads_sleep_at_once_beside_other_programs(
+    taken: int, spins: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    monkeypatch.setenv("GOMP_SPINCOUNT", "")
+    monkeypatch.delenv("GOMP_SPINCOUNT")
+    monkeypatch.setattr(threads, "taken_cores", lambda: taken)
+    prepare_pytorch()
+    assert os.environ["GOMP_SPINCOUNT"] == spins
+    prepare_pytorch()  # what was set stays
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    monkeypatch.delenv("GOMP_SPINCOUNT")
+    prepare_pytorch()
+    assert "GOMP_SPINCOUNT" not in os.environ
+
+
 def test_missing_packages_name_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     prepare_pytorch()
     assert os.environ["GOMP_SPINCOUNT"] == "7"
     monkeypatch.setattr("robo_manip_baselines.training.requirements.find_spec", lambda name: None)
-    with pytest.raises(RequestError, match=r"policies need torch, .*: pip install .*\[train\]"):
+    with pytest.raises(RequestError, match=r"policies need torch, .*pip install .*\[train\]"):
         prepare_pytorch()
 
 

@@ -21,7 +21,7 @@ from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import read_metrics
 from robo_manip_baselines.training import trainer as trainer_module
-from robo_manip_baselines.training.config import METRICS, TrainConfig
+from robo_manip_baselines.training.config import CONFIG, METRICS, TrainConfig, read_config
 from robo_manip_baselines.training.device import Processes
 from robo_manip_baselines.training.images import ImageStore
 from robo_manip_baselines.training.setup import TrainSetup
@@ -125,6 +125,43 @@ def test_resuming_is_exact(name: str, episodes: Path, tmp_path: Path) -> None:
         assert run(RUNS[name], episodes, tmp_path / "parts", stop_at=stop_at) == stop_at
     assert run(RUNS[name], episodes, tmp_path / "parts") == STEPS
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("name", ["average, cosine, warm-up, clipped", "images"])
+def test_an_extended_run_is_the_longer_run(name: str, episodes: Path, tmp_path: Path) -> None:
+    """Where the learning rate does not depend on the budget; the old end was a multiple of 3."""
+    steady = RUNS[name] + " --schedule constant"
+    run(steady, episodes, tmp_path / "whole")
+    run(f"{steady} --steps 6", episodes, tmp_path / "parts")
+    assert read_config(tmp_path / "parts" / CONFIG)["steps"] == 6
+    assert run(steady, episodes, tmp_path / "parts") == STEPS
+    assert read_config(tmp_path / "parts" / CONFIG)["steps"] == STEPS
+    whole, parts = contents(tmp_path / "whole"), contents(tmp_path / "parts")
+    for written in ("model", "trainer", "json"):
+        assert parts[written] == whole[written]
+    # the end of the first budget was validated, which the longer run has not done there
+    assert [line for line in parts["metrics"] if line in whole["metrics"]] == whole["metrics"]
+
+
+def test_a_cosine_goes_on_at_the_rate_of_the_new_budget(episodes: Path, tmp_path: Path) -> None:
+    curve = "Mlp --schedule cosine --warmup_steps 0 --learning_rate 1e-3 --log_every 1"
+    run(f"{curve} --steps 4", episodes, tmp_path / "run")
+    run(f"{curve} --steps 8", episodes, tmp_path / "run")
+    lines = [x for x in read_metrics(tmp_path / "run" / METRICS) if x["kind"] == "train"]
+    rates = [x["learning_rate"] for x in lines]
+    expected = [*(0.5e-3 * (1 + np.cos(np.pi * k / 4)) for k in range(4))]
+    expected += [0.5e-3 * (1 + np.cos(np.pi * k / 8)) for k in range(4, 8)]
+    np.testing.assert_allclose(rates, expected, rtol=1e-6)
+
+
+def test_a_budget_below_what_was_done_is_refused(episodes: Path, tmp_path: Path) -> None:
+    run("Mlp --steps 6", episodes, tmp_path / "run")
+    before = contents(tmp_path / "run")
+    with pytest.raises(RequestError, match=r"has done 6 steps already, more than 4; give a larger"):
+        run("Mlp --steps 4", episodes, tmp_path / "run")
+    with pytest.raises(RequestError, match=r"with batch_size \d+, not 2"):
+        run("Mlp --steps 9 --batch_size 2", episodes, tmp_path / "run")
+    assert contents(tmp_path / "run") == before
 
 
 def test_the_seed_decides_everything(episodes: Path, tmp_path: Path) -> None:

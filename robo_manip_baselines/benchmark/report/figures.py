@@ -27,6 +27,7 @@ from robo_manip_baselines.benchmark.statistics.conditions import (
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import EpisodeFigure
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import write_text
 
 INK = "#1f2328"
@@ -113,7 +114,7 @@ def render_figure(
         from matplotlib.figure import Figure
     except ImportError as error:
         raise RequestError(
-            f"figures need matplotlib ({error}); pip install 'robo_manip_baselines[train]'"
+            f"figures need matplotlib ({error}); run: {install_command('train')}"
         ) from None
     stream = io.StringIO()
     with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from robo_manip_baselines.benchmark.tables.benchmark import benchmark_tables
 from robo_manip_baselines.benchmark.tables.table import Table
 from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import write_text
 
 FOLDER = Path(__file__).parent
@@ -91,7 +92,7 @@ def read_video(path: Path, row: ResultRow) -> EpisodeVideo:
             width = min(VIDEO_WIDTH, track.width)
             size = (width, round(width * track.height / track.width))
             image = np.empty((0, 0, 3), dtype=np.uint8)
-            with VideoWriter(small, rate, crf=VIDEO_QUALITY) as video:
+            with VideoWriter(small, rate, crf=VIDEO_QUALITY, preset="medium") as video:
                 for number, frame in enumerate(source.decode(track)):
                     if number % FRAME_STEP == 0:
                         full = frame.to_ndarray(format="rgb24")
@@ -116,6 +117,7 @@ class Report:
         tables, figures: made from them.
         videos: of episodes.
         facts: at the top, such as the command and the machine: name -> text.
+        caution: why the results compare nothing; empty where they do.
     """
 
     title: str
@@ -124,6 +126,7 @@ class Report:
     figures: tuple[ReportFigure, ...]
     videos: tuple[EpisodeVideo, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
+    caution: str = ""
 
 
 def make_report(
@@ -131,14 +134,15 @@ def make_report(
     title: str,
     videos: Iterable[EpisodeVideo] = (),
     facts: Mapping[str, str] | None = None,
+    caution: str = "",
 ) -> Report:
-    """Make the tables and figures of a report.
+    """Make the tables and figures of a report; see `Report` for the arguments.
 
     Raises:
         RequestError: matplotlib is not installed.
     """
-    tables, figures = benchmark_tables(statistics), benchmark_figures(statistics)
-    return Report(title, statistics, tables, figures, tuple(videos), facts or {})
+    tables, figures = benchmark_tables(statistics, caution), benchmark_figures(statistics)
+    return Report(title, statistics, tables, figures, tuple(videos), facts or {}, caution)
 
 
 def write_report(path: Path, report: Report) -> None:
@@ -169,7 +173,7 @@ def render_report(report: Report) -> str:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
     except ImportError as error:
         raise RequestError(
-            f"reports need Jinja ({error}); pip install 'robo_manip_baselines[train]'"
+            f"reports need Jinja ({error}); run: {install_command('train')}"
         ) from None
     environment = Environment(
         loader=FileSystemLoader(FOLDER),
@@ -227,8 +231,7 @@ def general_facts(statistics: BenchmarkStatistics) -> dict[str, str]:
     facts = {
         "Environment": ", ".join(sorted({r.env for r in results})),
         "Episodes": f"{len(results)} of {len(statistics.conditions)} conditions",
-        "Training seeds": ", ".join(str(s) for s in statistics.train_seeds if s is not None)
-        or "none",
+        "Training runs": _training_runs(statistics.train_seeds),
         "Evaluation seeds": f"{len(seeds)} that all conditions have"
         + (f", from {seeds[0]} to {seeds[-1]}" if seeds else ""),
         "Recorded motion": f"{len({r.motion_clip for r in results})} clips of "
@@ -239,6 +242,16 @@ def general_facts(statistics: BenchmarkStatistics) -> dict[str, str]:
             f"{name} {' and '.join(sorted(found))}" for name, found in sorted(versions.items())
         )
     return facts
+
+
+def _training_runs(seeds: Sequence[int | None]) -> str:
+    """Describe the training runs of a condition; the seed alone reads as their number."""
+    trained = [str(seed) for seed in seeds if seed is not None]
+    if not trained:
+        return "none: no condition was trained"
+    if len(trained) == 1:
+        return f"1 of each condition (seed {trained[0]})"
+    return f"{len(trained)} of each condition (seeds {', '.join(trained)})"
 
 
 def row_data(statistics: BenchmarkStatistics) -> dict[str, Any]:

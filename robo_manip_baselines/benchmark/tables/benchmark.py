@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
@@ -17,9 +17,15 @@ from robo_manip_baselines.benchmark.statistics.inference import SIGNIFICANCE
 from robo_manip_baselines.benchmark.statistics.outcomes import RowSelection
 from robo_manip_baselines.benchmark.tables.table import NOTHING, Cell, Column, Row, Table
 
+VERDICTS = ("verdict", "is_compatible")
+"""Names of the columns that answer a question by a word."""
 
-def benchmark_tables(statistics: BenchmarkStatistics) -> tuple[Table, ...]:
-    """Return all tables that have a row, the most important first."""
+
+def benchmark_tables(statistics: BenchmarkStatistics, caution: str = "") -> tuple[Table, ...]:
+    """Return all tables that have a row, the most important first.
+
+    With a caution, why the results compare nothing, tables have no p-values and no verdicts.
+    """
     tables = (
         findings_table(statistics),
         success_table(statistics),
@@ -30,7 +36,29 @@ def benchmark_tables(statistics: BenchmarkStatistics) -> tuple[Table, ...]:
         times_beside_paper(statistics),
         failures_table(statistics),
     )
-    return tuple(table for table in tables if table.rows)
+    filled = [table for table in tables if table.rows]
+    return tuple(without_verdicts(table, caution) if caution else table for table in filled)
+
+
+def without_verdicts(table: Table, caution: str) -> Table:
+    """Return a table with "no comparison" for verdicts, no p-values and nothing in bold.
+
+    Where it had any of them, the caution is its first note.
+    """
+    names = [column.names[0] for column in table.columns]
+
+    def plain(name: str, cell: Cell) -> Cell:
+        nothing = (None,) * len(cell.values)
+        if name in VERDICTS:
+            return Cell("no comparison", nothing)
+        if name in ("p", "p_holm"):
+            return Cell(NOTHING, nothing)
+        return replace(cell, is_strong=False)
+
+    rows = tuple(replace(row, cells=tuple(map(plain, names, row.cells))) for row in table.rows)
+    is_comparison = bool({"p", *VERDICTS} & set(names))
+    notes = (f"No comparison: {caution}",) if is_comparison else ()
+    return replace(table, rows=rows, notes=(*notes, *table.notes))
 
 
 def percent(rate: float) -> str:

@@ -19,6 +19,7 @@ from face_prediction.models.learned import read_tensors
 from face_prediction.training import trainer as trainer_module
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import WindowBatch
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import read_metrics
 
 pytestmark = pytest.mark.long
@@ -82,6 +83,24 @@ def test_killed_and_carried_on_is_the_same_to_the_last_bit(
     monkeypatch.setattr(trainer_module, "save_predictor_checkpoint", save)
     assert run_train(options) == 0
     require_same_run(options.folder, whole)
+
+
+@quick
+def test_an_extended_run_is_the_longer_run(options) -> None:
+    """8 is a multiple of the interval of validation; the learning rate is that of no budget."""
+    options = replace(options, schedule="constant")
+    whole = replace(options, out=options.folder.with_name("whole"))
+    assert run_train(whole) == 0
+    assert run_train(replace(options, steps=8)) == 0
+    assert run_train(options) == 0
+    for name in ("model.safetensors", "trainer.safetensors"):
+        assert same(tensors(options.folder, name), tensors(whole.folder, name))
+    written = [folder / "config.json" for folder in (options.folder, whole.folder)]
+    assert written[0].read_text() == written[1].read_text()
+    with pytest.raises(RequestError, match="has done 12 steps already, more than --steps 9"):
+        run_train(replace(options, steps=9))
+    with pytest.raises(RequestError, match=r"with training\.batch_size 3, not 2"):
+        run_train(replace(options, steps=20, batch_size=2))
 
 
 SCRIPT = """

@@ -24,6 +24,8 @@ APT_PACKAGES: dict[str, tuple[str, ...]] = {
     "osmesa": ("libosmesa6",),
     "glfw": ("libgl1", "libgl1-mesa-dri"),
 }
+DEVICE = "MUJOCO_EGL_DEVICE_ID"
+"""Environment variable from which MuJoCo takes the number of the EGL device."""
 PROBE_TIMEOUT = 120.0  # seconds; a cold start of software rendering takes about two
 
 # Draws a red ball, off screen, in a process of its own: a backend is chosen once per process, and
@@ -98,9 +100,53 @@ def _probe(backend: str) -> tuple[str, str | None]:
     reason = (probe.stderr.strip().splitlines() or [f"exit code {probe.returncode}"])[-1]
     if "No module named 'mujoco'" in reason:
         return "", f"MuJoCo is not installed for {sys.executable}; run: pip install mujoco"
+    return "", explain_failure(backend, reason)
+
+
+def explain_failure(backend: str, reason: str) -> str:
+    """Return one line with the cause of a failure to render and what to do.
+
+    A wrong environment variable is told from a missing library, which alone is to be installed.
+
+    Args:
+        backend: key of ``APT_PACKAGES``.
+        reason: last line of the backend's own error.
+    """
+    platform = os.environ.get("PYOPENGL_PLATFORM", "")
+    if platform and platform.lower() != backend:
+        return f"PYOPENGL_PLATFORM={platform}: does not go with MUJOCO_GL={backend}; unset it"
     if backend == "glfw" and not os.environ.get("DISPLAY"):
-        return "", "MUJOCO_GL=glfw needs a display and $DISPLAY is not set; use MUJOCO_GL=egl"
-    return "", f"no OpenGL backend '{backend}' [{reason}]; run: {apt_line(backend)}"
+        return "MUJOCO_GL=glfw needs a display and $DISPLAY is not set; use MUJOCO_GL=egl"
+    given = os.environ.get(DEVICE)
+    if backend == "egl" and given is not None and (count := _count_egl_devices()):
+        choices = "0" if count == 1 else f"0 to {count - 1}"
+        there = f"there {'is' if count == 1 else 'are'} {count}, valid: {choices}, or unset it"
+        try:
+            number = int(given)
+        except ValueError:
+            return f"{DEVICE}='{given}': must be the number of an EGL device; {there}"
+        if not 0 <= number < count:
+            return f"{DEVICE}={given}: there is no such EGL device; {there}"
+        return f"{DEVICE}={given}: this EGL device cannot draw [{reason}]; {there}"
+    return f"no OpenGL backend '{backend}' [{reason}]; run: {apt_line(backend)}"
+
+
+def _count_egl_devices() -> int:
+    """Return how many devices EGL lists; 0 where there is no EGL."""
+    environment = {k: v for k, v in os.environ.items() if k != DEVICE} | {"MUJOCO_GL": "egl"}
+    code = "from mujoco.egl import egl_ext; print(len(egl_ext.eglQueryDevicesEXT()))"
+    try:
+        answer = subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PROBE_TIMEOUT,
+            check=True,
+        )
+        return int(answer.stdout)
+    except (subprocess.SubprocessError, ValueError):
+        return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

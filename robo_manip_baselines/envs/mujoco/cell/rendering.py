@@ -26,7 +26,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.opengl import APT_PACKAGES, apt_line, backend_in_use
+from robo_manip_baselines.envs.mujoco.cell.opengl import (
+    APT_PACKAGES,
+    backend_in_use,
+    explain_failure,
+)
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 _MAX_GEOMS: Final = 2000
@@ -208,8 +212,9 @@ def _make_context(model: mujoco.MjModel, height: int, width: int) -> tuple[Any, 
         return gl, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
     except Exception as error:  # each backend fails in a way of its own, down to AttributeError
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        fix = f"; run: {apt_line(backend)}" if backend in APT_PACKAGES else ""
-        problem = f"no OpenGL to draw cameras with ({backend}: {reason}){fix}"
+        problem = f"no OpenGL to draw cameras with ({backend}: {reason})"
+        if backend in APT_PACKAGES:
+            problem = explain_failure(backend, reason)
         raise RequestError(f"{problem} (--cameras none needs no OpenGL)") from error
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from robo_manip_baselines.envs.mujoco.cell.vx300s import arm_spec
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.extras import pip_install
 
 TIMESTEP: Final = 0.002
 """Physics step, seconds: ten make one control step at 50 Hz."""
@@ -64,7 +65,7 @@ def require_mujoco(version: str = mujoco.__version__) -> None:
     if number < (3, 17) or version == "4.0.0":
         raise RequestError(
             f"MuJoCo {version} is not supported (valid: 3.17 or later, but not 4.0.0, whose "
-            "accelerations are wrong); run: pip install 'mujoco>=3.17,!=4.0.0'"
+            f"accelerations are wrong); run: {pip_install('mujoco>=3.17,!=4.0.0')}"
         )
 
 
