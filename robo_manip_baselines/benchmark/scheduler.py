@@ -214,7 +214,7 @@ class GridProgress:
         self._ended: set[str] = set()
         self._started: dict[str, float] = {}
         form = "{percentage:3.0f}% |{bar}| {elapsed}{postfix}"
-        self._bar = ProgressBar(1.0, "", shown=bar, form=form)
+        self._bar = ProgressBar(1.0, "", shown=bar, form=form, clock=clock)
 
     def add(self, items: Iterable[WorkItem]) -> None:
         """Add the items that were to follow later."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 
 from robo_manip_baselines.benchmark.scheduler import GridProgress
@@ -55,6 +57,30 @@ def test_what_is_planned_later_counts_from_the_start() -> None:
     for video in videos:
         progress.end(video, None)  # failed: it is over all the same
     assert (progress.fraction, progress.seconds_left) == (1.0, 0.0)
+
+
+def test_a_log_gets_few_lines_which_say_one_thing(caplog: pytest.LogCaptureFixture) -> None:
+    """The share of the work and the time left; no count of items that would say another."""
+    clock = Clock()
+    items = [item("training", str(n), 100.0) for n in range(40)]
+    with caplog.at_level(logging.INFO):
+        progress = GridProgress(items, 2, later=1000.0, clock=clock)
+        for first, second in zip(items[::2], items[1::2], strict=True):
+            progress.start(first)
+            progress.start(second)
+            for _ in range(200):  # twice a second, as an executor waits
+                clock.now += 0.5
+                progress.show()
+            progress.end(first, 100.0)
+            progress.end(second, 100.0)
+        progress.close()
+    lines = caplog.messages
+    assert 8 <= len(lines) <= 20
+    assert not any("items" in line or " of " in line for line in lines)
+    assert lines[0] == "0 %, 10 s, about 42 min left, training 0 and 1 more"
+    assert lines[-1].startswith("80 %, 33 min, about 8 min left")
+    shares = [int(line.partition(" %")[0]) for line in lines]
+    assert shares == sorted(shares)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ import pytest
 from robo_manip_baselines.benchmark.report.page import (
     EpisodeVideo,
     Report,
+    _training_runs,
     episodes_to_show,
     general_facts,
     link,
@@ -222,6 +223,26 @@ def test_facts_of_the_study(statistics: BenchmarkStatistics) -> None:
         "Recorded motion": "7 clips of 5 people",
         "Versions": "numpy 2",
     }
+
+
+@pytest.mark.parametrize(
+    ("train_seeds", "words"),
+    [
+        ((0,), "1 of each condition (seed 0)"),
+        ((0, 1, 2), "3 of each condition (seeds 0, 1, 2)"),
+        ((None,), "none: no condition was trained"),
+    ],
+)
+def test_training_runs_are_counted(train_seeds: tuple[int | None, ...], words: str) -> None:
+    assert _training_runs(train_seeds) == words
+
+
+@pytest.mark.long
+def test_a_caution_stands_at_the_top(statistics: BenchmarkStatistics) -> None:
+    page = render_report(make_report(statistics, "Smoke", caution="Hardly <trained>."))
+    assert "<strong>No comparison.</strong> Hardly &lt;trained&gt;." in page
+    assert page.index("No comparison.") < page.index('<nav aria-label="Contents">')
+    assert "No comparison" not in render_report(make_report(statistics, "Whole"))
 
 
 @pytest.mark.long

@@ -179,6 +179,26 @@ def test_paper_is_white_whatever_the_reader_likes(opened: Opened) -> None:
     opened.page.emulate_media(media="screen", color_scheme="light")
 
 
+def test_a_phone_shows_numbers_beside_the_labels(opened: Opened) -> None:
+    """390 px: the page itself does not scroll sideways, and a label leaves room for numbers."""
+    opened.page.set_viewport_size({"width": 390, "height": 844})
+    try:
+        width, tables = opened.page.evaluate(
+            """() => [document.documentElement.scrollWidth,
+                 [...document.querySelectorAll("main table tbody tr:first-child")].map((row) => {
+                   const ends = [...row.cells].map((cell) => cell.getBoundingClientRect().right);
+                   return [row.cells[0].offsetWidth, ends.filter((end) => end <= 390).length];
+                 })]"""
+        )
+    finally:
+        opened.page.set_viewport_size({"width": 1280, "height": 900})
+    assert width == 390
+    assert tables
+    for label, cells in tables:
+        assert label <= 130, tables
+        assert cells >= 2, tables
+
+
 def test_a_table_sorts(opened: Opened) -> None:
     table = opened.page.locator("#table-success table")
     head = table.locator("thead th", has_text="Success").first

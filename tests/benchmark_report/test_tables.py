@@ -116,6 +116,25 @@ def test_p_values_are_bold_below_the_limit(statistics: BenchmarkStatistics) -> N
 
 
 @pytest.mark.long
+def test_untrained_policies_are_not_compared(statistics: BenchmarkStatistics) -> None:
+    """No p-value, no verdict and nothing in bold; the numbers themselves stay."""
+    plain = {table.name: table for table in benchmark_tables(statistics)}
+    for table in benchmark_tables(statistics, "hardly trained"):
+        before = plain[table.name]
+        names = [column.names[0] for column in table.columns]
+        is_comparison = bool({"p", "verdict", "is_compatible"} & set(names))
+        assert ("No comparison: hardly trained" in table.notes) == is_comparison
+        for row, old in zip(table.rows, before.rows, strict=True):
+            for name, cell, own in zip(names, row.cells, old.cells, strict=True):
+                assert not cell.is_strong
+                if name in ("verdict", "is_compatible"):
+                    assert cell.text == "no comparison"
+                elif name in ("p", "p_holm"):
+                    assert (cell.text, cell.values) == ("–", (None,))
+                else:
+                    assert cell.values == own.values
+
+
 def test_written_whole_in_three_formats(tmp_path: Path, statistics: BenchmarkStatistics) -> None:
     tables = benchmark_tables(statistics)
     paths = write_tables(tmp_path / "tables", tables)

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,25 @@ import pytest
 
 from robo_manip_baselines.commands.rollout import parse_options, to_collection
 from robo_manip_baselines.data import EpisodeReader, list_episodes, read_metadata, write_episode
+from robo_manip_baselines.data.files import list_failures
 from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
-from robo_manip_baselines.rollout.demonstrate import Collection, collect, deviation
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.rollout.demonstrate import (
+    Collection,
+    collect,
+    deviation,
+    remake_env,
+    replay,
+)
+from robo_manip_baselines.rollout.videos import (
+    PLAIN,
+    preview_frames,
+    side_by_side,
+    write_preview,
+)
 from robo_manip_baselines.runs.errors import RequestError
 
 pytestmark = pytest.mark.long
@@ -109,6 +125,44 @@ def test_carries_on_where_it_was(folder: Path, tmp_path: Path) -> None:
     assert contents(out) == contents(folder)
     assert (out / "episode_000000.hdf5").stat().st_mtime_ns == kept
     assert not list(out.glob(".*"))
+
+
+def test_the_summary_is_of_the_whole_folder(folder: Path, tmp_path: Path) -> None:
+    """Two calls, the second with other seeds: as one call over all of them."""
+    out = tmp_path / "two calls"
+    shutil.copytree(folder, out)
+    found = collect(collection(out, "--seed", "7", "--num_episodes", "1"))
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["episodes"], summary["first_seed"]) == (4, 0)
+    paths = list_episodes(out)
+    times = [read_metadata(path)["completion_time"] for path in paths]
+    assert found.successes == summary["successes"] == len(paths)
+    assert summary["completion_time_mean"] == pytest.approx(np.mean(times))
+    again = collect(collection(out, "--seed", "7", "--num_episodes", "1"))
+    assert (again.episodes, again.steps, again.steps_per_second) == (4, 0, None)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("cameras", ["top,angle,front_close", "none"])
+def test_the_preview_is_the_episode(cameras: str, tmp_path: Path) -> None:
+    """Recorded images where there are some, else rendered ones: the same views, the same bytes."""
+    wanted = collection(tmp_path, "--num_episodes", "1", "--image_size", "360x480")
+    kwargs = {"cameras": () if cameras == "none" else cameras.split(","), "max_episode_steps": 12}
+    collect(replace(wanted, env_kwargs={**wanted.env_kwargs, **kwargs}))
+    episodes = list_episodes(tmp_path) or list_failures(tmp_path)
+    for name in ("a.mp4", "b.mp4"):
+        write_preview(tmp_path / name, episodes)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    frames = list(preview_frames(episodes[0]))
+    assert {frame.shape for frame in frames} == {(360, 3 * 480, 3)}
+    assert len(frames) == 6
+    with EpisodeReader(episodes[0]) as episode, closing(remake_env(episode, **PLAIN)) as env:
+        for step in replay(env, episode):
+            if step % 2 == 0:
+                views = world_of(env).renderer.render(world_of(env).data, CAMERAS)
+                plain = side_by_side(list(views.values())).astype(int)
+                # JPEG, the track and the caption; another step or camera would differ by 10
+                assert np.abs(frames[step // 2] - plain).mean() < 3.0
 
 
 def test_refuses_to_mix_settings(folder: Path, tmp_path: Path) -> None:

@@ -84,6 +84,16 @@ def test_evaluates_and_carries_on(
     assert re.search(r"^speed +-$", capsys.readouterr().out, re.M)
 
 
+def test_the_summary_is_of_the_whole_folder(run_folder: Path, tmp_path: Path) -> None:
+    evaluate(config(run_folder, "--seed 1002 --num_episodes 2", out=tmp_path))
+    _, last, _ = evaluate(config(run_folder, "--seed 1000 --num_episodes 1", out=tmp_path))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert last.episodes == summary["episodes"] == len(read_results(tmp_path)) == 3
+    assert summary["first_seed"] == 1000
+    assert summary["failed_seeds"] == [1000, 1002, 1003]
+    assert summary["episodes_per_second"] == pytest.approx(1 / summary["seconds"])
+
+
 def test_results_of_another_execution_are_not_mixed(run_folder: Path, tmp_path: Path) -> None:
     evaluate(config(run_folder, "--num_episodes 1 --execute 3", out=tmp_path))
     with pytest.raises(RequestError, match="holds results with acting"):
