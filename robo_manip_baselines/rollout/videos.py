@@ -46,7 +46,7 @@ TRACK_STEPS = 100
 VIEW_SIZE = (360, 480)
 """Height and width of each camera's view in pixels: three of them fit a screen."""
 
-LOOK = {"image_size": VIEW_SIZE, "shadows": True, "multisamples": 4}
+LOOK = {"image_size": VIEW_SIZE, "render_size": None, "shadows": True, "multisamples": 4}
 """Arguments of an environment whose images are for people."""
 
 CLOSE_UP = "front_close"

@@ -20,8 +20,9 @@ def require_choice(what: str, given: str, valid: Iterable[str]) -> str:
         RequestError: naming the valid choices, and the nearest one if there is any.
     """
     choices = sorted(valid)
-    if given in choices:
+    text = given if isinstance(given, str) else " ".join(repr(given).split())
+    if isinstance(given, str) and given in choices:
         return given
-    close = difflib.get_close_matches(given, choices, n=1)
+    close = difflib.get_close_matches(text, choices, n=1)
     hint = f" (did you mean '{close[0]}'?)" if close else ""
-    raise RequestError(f"unknown {what} '{given}'{hint}; valid: {', '.join(choices)}")
+    raise RequestError(f"unknown {what} '{text}'{hint}; valid: {', '.join(choices)}")

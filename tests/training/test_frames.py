@@ -14,9 +14,10 @@ from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training import images as images_module
-from robo_manip_baselines.training.images import ImageStore, fit_image, free_memory
+from robo_manip_baselines.training.images import ImageStore, free_memory
 
 # Not the order in which files keep them.
 CAMERAS = ("top", "angle", "front_close")
