@@ -25,7 +25,7 @@ from robo_manip_baselines.observation.state import (
     State,
     TargetObservation,
 )
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 
 PRESETS = ("baseline", "current", "current_pred")
 """The paper's three observation groups (section IV.C)."""
@@ -122,9 +122,7 @@ class ObservationSpec:
             require_choice("camera", camera, CAMERAS)
         if len(set(self.cameras)) != len(self.cameras):
             raise RequestError(f"cameras {', '.join(self.cameras)}: each may be named once")
-        horizon = as_whole_number(self.horizon)
-        if horizon is None or not 1 <= horizon <= MAX_HORIZON:
-            raise RequestError(f"horizon {self.horizon}: must be 1 to {MAX_HORIZON} frames")
+        horizon = require_integer("horizon", self.horizon, 1, MAX_HORIZON, " frames")
         object.__setattr__(self, "horizon", horizon)
         if not isinstance(self.object_pose, bool | np.bool_):
             raise RequestError(f"object_pose {self.object_pose!r}: must be True or False")
@@ -290,13 +288,6 @@ class ObservationSpec:
         return timed[:, 1:].astype(np.float64)
 
 
-def as_whole_number(value: object) -> int | None:
-    """Return a Python or NumPy integer as an ``int``; None for anything else, ``bool`` included."""
-    if isinstance(value, int | np.integer) and not isinstance(value, bool):
-        return int(value)
-    return None
-
-
 def _camera_names(given: object) -> tuple[str, ...]:
     """Return the names of cameras: one name, several, and as command lines write them.
 
@@ -318,14 +309,15 @@ def _checked_size(what: str, given: object) -> tuple[int, int]:
     Raises:
         RequestError: they are no two numbers from 1 to ``MAX_IMAGE_SIZE``.
     """
-    sides = list(given) if isinstance(given, Sequence | np.ndarray) else []
-    height, width = map(as_whole_number, sides) if len(sides) == 2 else (None, None)
-    if height and width and 1 <= min(height, width) <= max(height, width) <= MAX_IMAGE_SIZE:
-        return height, width
-    raise RequestError(
-        f"{what} {given!r}: must be height and width, two whole numbers from 1 to "
-        f"{MAX_IMAGE_SIZE}, for example (240, 320)"
-    )
+    sides = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
+    try:
+        height, width = (require_integer(what, side, 1, MAX_IMAGE_SIZE) for side in sides)
+    except ValueError:
+        raise RequestError(
+            f"{what} {given!r}: must be height and width, two whole numbers from 1 to "
+            f"{MAX_IMAGE_SIZE}, for example (240, 320)"
+        ) from None
+    return height, width
 
 
 def _state_names(arms: Sequence[str]) -> list[str]:

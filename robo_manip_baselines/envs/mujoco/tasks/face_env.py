@@ -31,10 +31,9 @@ from robo_manip_baselines.observation import (
     ObservedNames,
     State,
 )
-from robo_manip_baselines.observation.corruption import NO_PREDICTION
+from robo_manip_baselines.observation.corruption import MAX_SEED, NO_PREDICTION
 from robo_manip_baselines.observation.images import fit_image
-from robo_manip_baselines.observation.spec import as_whole_number
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 
 Floats = NDArray[np.float64]
 
@@ -46,9 +45,6 @@ PARKED_QPOS = (0.0, -1.8, 1.55, 0.0, -1.2, 0.0)
 
 RENDER_CAMERA = "angle"
 """Camera of ``render()``."""
-
-MAX_SEED = 2**63 - 1
-"""Largest seed of an episode: the largest integer that an episode file holds."""
 
 # Wide enough for whatever physics may do; observations are not clipped to them.
 _BOUNDS = {" position": 2.0 * np.pi, " velocity": 100.0, "t_": 60.0, "": 5.0}
@@ -240,7 +236,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 f"reset option {given}: unknown; an episode has no options, give arguments to "
                 "gymnasium.make instead"
             )
-        super().reset(seed=_checked_seed(seed))
+        if seed is not None:
+            seed = require_integer("seed", seed, 0, MAX_SEED)
+        super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         self.step_count = 0
         self.motion_start: int | None = 0 if self.face_motion == "episode" else None
@@ -262,7 +260,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         mujoco.mj_forward(self.model, self.data)
         if self._pipeline:
             # Last, so that the world is the same as without corruption.
-            self._pipeline.reset(int(self.np_random.integers(2**32)) if seed is None else int(seed))
+            self._pipeline.reset(int(self.np_random.integers(2**32)) if seed is None else seed)
         self._stage = "reset"
         self._show()
         return self.observe(), self.info()
@@ -309,9 +307,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         """
         names, form = self.action_names, f"must be ({len(self._actuators)},) finite numbers"
         try:
-            values = np.asarray(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"action {' '.join(repr(action).split())}: {form}") from None
+            values = np.asarray(action)
+        except (TypeError, ValueError):  # rows of different lengths, say
+            values = np.asarray(None)
+        if values.dtype.kind not in "fiu":
+            raise ValueError(f"action {' '.join(repr(action).split())}: {form}")
+        values = values.astype(np.float64)
         if values.shape != (len(names),):
             raise ValueError(f"action of shape {values.shape}: {form}")
         if len(bad := np.flatnonzero(~np.isfinite(values))):
@@ -587,9 +588,7 @@ def _make_corruption(given: Any) -> Corruption:
 def _check_drawing(shadows: Any, multisamples: Any) -> None:
     if not isinstance(shadows, bool | np.bool_):
         raise RequestError(f"shadows {shadows!r}: must be True or False")
-    number = as_whole_number(multisamples)
-    if number is None or not 0 <= number <= MAX_MULTISAMPLES:
-        raise RequestError(f"multisamples {multisamples!r}: must be 0 to {MAX_MULTISAMPLES}")
+    require_integer("multisamples", multisamples, 0, MAX_MULTISAMPLES)
 
 
 def _clip_names(given: Any) -> tuple[str, ...] | None:
@@ -600,17 +599,3 @@ def _clip_names(given: Any) -> tuple[str, ...] | None:
     if not isinstance(names, Sequence) or not names:
         raise RequestError(f"clips {given!r}: must be ids of clips, at least one, or None for all")
     return tuple(names)
-
-
-def _checked_seed(seed: Any) -> int | None:
-    """Return a seed as Gymnasium takes it.
-
-    Raises:
-        RequestError: it is no whole number from 0 to ``MAX_SEED``.
-    """
-    if seed is None:
-        return None
-    number = as_whole_number(seed)
-    if number is None or not 0 <= number <= MAX_SEED:
-        raise RequestError(f"seed {seed!r}: must be a whole number from 0 to {MAX_SEED}, or None")
-    return number
