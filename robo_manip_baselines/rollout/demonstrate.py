@@ -300,11 +300,6 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     Raises:
         RequestError: naming the first setting that differs.
     """
-    done = sorted(finished_seeds(collection.out))
-    present = next((path for seed in done if (path := collection.path(seed))), None)
-    if present is None:
-        return
-    there = read_metadata(present)
     wanted = {
         "env_id": task_entry(collection.env).env_id,
         "env_kwargs": collection.env_kwargs,
@@ -313,12 +308,16 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
         "image_quality": collection.quality,
         "xml_hash": xml_hash,
     }
-    for name, value in wanted.items():
-        if there[name] != value:
-            raise RequestError(
-                f"'{collection.out}' holds episodes with {name} {there[name]}, not {value}; "
-                "give another --out or remove that folder"
-            )
+    for seed in sorted(finished_seeds(collection.out)):
+        if (path := collection.path(seed)) is None:
+            continue
+        there = read_metadata(path)
+        for name, value in wanted.items():
+            if there[name] != value:
+                raise RequestError(
+                    f"'{collection.out}' holds episodes with {name} {there[name]} ({path.name}), "
+                    f"not {value}; give another --out or remove that folder"
+                )
 
 
 @dataclass(frozen=True)

@@ -67,14 +67,6 @@ def test_images_are_those_of_the_files(
                 source.images(np.array([0, wrong]))
 
 
-def test_pixels_are_means_of_the_area_they_stand_for() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
-    means = image.reshape(4, 2, 3, 4, 3).mean(axis=(1, 3))
-    # Rounding, in OpenCV of halves to even.
-    assert np.abs(fit_image(image, (4, 3)).astype(float) - means).max() <= 0.5
-    assert fit_image(image, (8, 12)) is image
-
-
 @pytest.mark.parametrize("is_held", [True, False])
 def test_damage_is_an_error_that_names_the_frame(tmp_path: Path, is_held: bool) -> None:
     loaded, _ = load(tmp_path)

@@ -6,11 +6,13 @@ Shapes: N frames of the whole library, R runs, M frames of a segment, H = 5 fram
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +161,22 @@ class MotionLibrary:
             source=source,
             predicted=content[PREDICTION].astype(np.float64) if PREDICTION in content else None,
         )
+
+    @cached_property
+    def motion_digest(self) -> str:
+        """SHA-256 of the recorded motion, without predictions."""
+        names = (self.fps, self.run_clip, self.run_subject)
+        arrays = (self.mouth, self.orientation, self.jaw, self.run_start, self.run_length)
+        return hashlib.sha256(
+            json.dumps(names).encode() + b"".join(array.tobytes() for array in arrays)
+        ).hexdigest()
+
+    @cached_property
+    def prediction_digest(self) -> str | None:
+        """SHA-256 of the predictions; None in a library without."""
+        if self.predicted is None:
+            return None
+        return hashlib.sha256(self.predicted.tobytes()).hexdigest()
 
     def starts(self) -> NDArray[np.int64]:
         """Return, (R,), how many frames of each run can start a segment of `SEGMENT_DURATION`."""
