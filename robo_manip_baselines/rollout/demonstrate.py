@@ -315,8 +315,8 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
         for name, value in wanted.items():
             if there[name] != value:
                 raise RequestError(
-                    f"'{collection.out}' holds episodes with {name} {there[name]} ({path.name}), "
-                    f"not {value}; give another --out or remove that folder"
+                    f"'{collection.out}' holds episodes with {name} {there[name]}, not {value} "
+                    f"({path.name}); give another --out or remove that folder"
                 )
 
 

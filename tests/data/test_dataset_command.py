@@ -73,6 +73,15 @@ def test_info_counts_what_is_there(folder: Path) -> None:
     assert all(value in done.stdout for value in rows.values())
 
 
+def test_info_takes_no_mean_over_a_mixture(folder: Path) -> None:
+    path = episode_path(folder, 9, True)
+    write_episode(path, make_arrays(10), make_images(10), make_attributes(9) | {"expert": "other"})
+    rows = dataset_info(folder)
+    for name in ("duration", "completion time"):
+        assert "differ in expert: " in rows[name]
+        assert "±" not in rows[name]
+
+
 @pytest.mark.parametrize("command", ["verify", "info"])
 def test_wrong_folder_is_one_line(command: str, tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "none"):

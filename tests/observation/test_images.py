@@ -137,9 +137,7 @@ def test_images_that_were_recorded_shrunk_are_shown_so(tmp_path: Path) -> None:
         {"image_size": (24, 32), "render_size": (96, 128)},
     ],
 )
-def test_images_of_two_sizes_do_not_mix(
-    tmp_path: Path, sizes: dict[str, tuple[int, int]]
-) -> None:
+def test_images_of_two_sizes_do_not_mix(tmp_path: Path, sizes: dict[str, tuple[int, int]]) -> None:
     record(tmp_path, "FeedingEnv", 0, image_size=(24, 32))
     record(tmp_path, "FeedingEnv", 1, **sizes)
     spec = ObservationSpec(cameras=CAMERAS, image_size=(12, 16))
