@@ -212,9 +212,11 @@ def test_wrong_actions_get_one_clear_line(name: str, action: Any, message: str) 
 
 @pytest.mark.parametrize("seed", [-1, 1.0, "3", True, 2**63, np.int64(-1), [1]])
 def test_wrong_seeds_are_refused(name: str, seed: Any) -> None:
-    with contextlib.closing(make_env(name, cameras=())) as env:
-        with pytest.raises(RequestError, match=r"^seed .*: must be 0 to 9223372036854775807"):
-            env.reset(seed=seed)
+    with (
+        contextlib.closing(make_env(name, cameras=())) as env,
+        pytest.raises(RequestError, match=r"^seed .*: must be 0 to 9223372036854775807"),
+    ):
+        env.reset(seed=seed)
 
 
 def test_integers_of_numpy_are_seeds(name: str) -> None:
@@ -230,7 +232,7 @@ def test_integers_of_numpy_are_seeds(name: str) -> None:
 def test_options_of_an_episode_are_not_ignored(name: str) -> None:
     with contextlib.closing(make_env(name, cameras=())) as env:
         env.reset(seed=0, options={})
-        with pytest.raises(RequestError, match="^reset option clip, x: unknown"):
+        with pytest.raises(RequestError, match=r"^reset option clip, x: unknown"):
             env.reset(seed=0, options={"clip": "clm_cap12", "x": 1})
 
 

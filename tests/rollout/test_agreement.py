@@ -134,14 +134,14 @@ def test_an_episode_counts_once(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["outcome matrix", "statistics"])
 def test_training_runs_have_the_same_seeds(name: str) -> None:
-    with pytest.raises(RequestError, match="seed 1002 has no counterpart in .* training seed 1"):
+    with pytest.raises(RequestError, match=r"seed 1002 has no counterpart in .* training seed 1"):
         AGGREGATIONS[name](make_rows()[:-1])
 
 
 def test_conditions_have_the_same_seeds() -> None:
     rows = make_rows(conditions=["current", "baseline"])
     kept = [row for row in rows if (row.condition, row.seed) != ("baseline", 1000)]
-    with pytest.raises(RequestError, match="'current'.* seed 1000 has no counterpart .*'baseline'"):
+    with pytest.raises(RequestError, match=r"'current'.* seed 1000 has no counter.*'baseline'"):
         as_statistics(kept)
 
 
@@ -157,7 +157,7 @@ def test_conditions_share_a_world(message: str) -> None:
 
 def test_training_runs_and_conditions_may_differ_in_what_they_are_about() -> None:
     as_matrix(make_rows(train_seeds=3))
-    with pytest.raises(RequestError, match="train_seed|checkpoint"):
+    with pytest.raises(RequestError, match=r"train_seed|checkpoint"):
         as_summary([*make_rows(train_seeds=1), replace(ROW, seed=1003, train_seed=1)])
     rows = make_rows(conditions=["current", "baseline"])
     other = {"prediction": "f" * 64, "training": "f" * 64, "execution": {"execute": 5}}

@@ -579,7 +579,7 @@ def _checked_render_mode(mode: Any, valid: Iterable[str]) -> str | None:
 
 
 def _make_corruption(given: Any) -> Corruption:
-    """Return a corruption given as such or as a mapping; anything else is for the spec to refuse."""
+    """Return a corruption given as such or as a mapping; the spec refuses anything else."""
     if given is None:
         return Corruption()
     return Corruption.from_json(given) if isinstance(given, Mapping) else given
