@@ -20,6 +20,7 @@ from robo_manip_baselines.data import EpisodeReader, list_episodes
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.normalization import mean_std
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
+from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.observation.spec import parse_image_size
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
@@ -28,7 +29,7 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import decode_image
 from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler
 from robo_manip_baselines.training.device import choose_device
-from robo_manip_baselines.training.images import ImageStore, fit_image, processors
+from robo_manip_baselines.training.images import ImageStore, processors
 
 EXAMPLE = "python benchmarks/batch_loading.py --batch_size 8 --image_size 240x320"
 

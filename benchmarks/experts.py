@@ -86,7 +86,14 @@ def play(world: FeedingEnv, expert: str, seed: int) -> ExpertEpisode:
 
 def table(name: str, outcomes: dict[str, list[ExpertEpisode]]) -> Iterator[str]:
     """Lay outcomes out as Markdown, a row for each group."""
-    heads = [name, "success", "strict", "touched face", "let go outside", "completion time (s)"]
+    heads = [
+        name,
+        "success",
+        "strict",
+        "touched face",
+        "let go outside",
+        "completion time (s, mean ± sd)",
+    ]
     heads += ["slip (mm)", "force (N)", "failed"]
     yield f"| {' | '.join(heads)} |"
     yield "|---" * len(heads) + "|"

@@ -6,7 +6,7 @@ Legend: B histories, T frames of history, H horizon, L = 468 landmarks, S side o
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -88,12 +88,14 @@ class FittedPredictor:
         folder: of a trained network.
         checkpoint: of a trained network, as in ``results.json``: folder, name, preset, test fold,
             number of subjects, SHA-256 of the weights.
+        shared: settings of a trained network that all folds of one evaluated predictor have.
     """
 
     predictor: Predictor
     subjects: frozenset[str]
     folder: Path | None = None
     checkpoint: Mapping[str, Any] | None = None
+    shared: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,13 @@ def load_network(folder: Path, dataset_sha256: str) -> FittedPredictor:
         "train_subjects": len(network.record.train_subjects),
         "sha256": file_digest(folder / "model.safetensors"),
     }
-    return FittedPredictor(network, frozenset(network.record.train_subjects), folder, record)
+    shared = {
+        "settings": network.record.settings,
+        "training": network.record.training,
+        "dataset": network.record.dataset,
+    }
+    subjects = frozenset(network.record.train_subjects)
+    return FittedPredictor(network, subjects, folder, record, shared)
 
 
 def group_networks(loaded: Sequence[FittedPredictor]) -> list[EvaluatedPredictor]:
@@ -223,7 +231,7 @@ def group_networks(loaded: Sequence[FittedPredictor]) -> list[EvaluatedPredictor
     The preset is part of the name in tables where there are several of a network's name.
 
     Raises:
-        RequestError: two are of the same name, preset and fold.
+        RequestError: two are of the same name, preset and fold, or of other settings.
     """
     groups: dict[tuple[str, str], list[FittedPredictor]] = {}
     for fitted in loaded:
@@ -278,4 +286,18 @@ def _one_for_each_fold(name: str, networks: Sequence[FittedPredictor]) -> Evalua
                 f"{first.folder} and {fitted.folder} are both {name} for test fold {fold}; give "
                 "one checkpoint for each fold"
             )
+        _require_same_settings(name, networks[0], fitted)
     return EvaluatedPredictor(name, dict(sorted(by_fold.items())))
+
+
+def _require_same_settings(name: str, one: FittedPredictor, other: FittedPredictor) -> None:
+    """Raise RequestError if the networks of two folds were trained with different settings."""
+    for part in one.shared:
+        ours, theirs = one.shared[part], other.shared[part]
+        for key in sorted({*ours, *theirs}):
+            if ours.get(key) != theirs.get(key):
+                raise RequestError(
+                    f"{one.folder} and {other.folder} are both {name}, with {part} {key} "
+                    f"{ours.get(key)} and {theirs.get(key)}; a row of the tables is of one "
+                    "network: train all folds alike"
+                )

@@ -126,7 +126,7 @@ class ConditionConfig:
 
 
 _NOT_OF_A_CONDITION = (
-    *("cameras", "image_size", "object_pose", "arms", "corruption"),  # of the preset
+    *("cameras", "image_size", "render_size", "object_pose", "arms", "corruption"),  # of the preset
     *("error_stats", "stats_sha256"),  # one file for all conditions
 )
 

@@ -70,6 +70,7 @@ def dataset_info(folder: Path) -> dict[str, str]:
     strict = sum(item["is_success_strict"] for item in metadata)
     durations = [item["num_steps"] * item["control_period"] for item in metadata]
     times = [item["completion_time"] for item in metadata if item["is_success"]]
+    mixture = _mixture(metadata)
     subjects = {item["motion_subject"] for item in metadata}
     clips = {item["motion_clip"] for item in metadata}
     return {
@@ -79,8 +80,8 @@ def dataset_info(folder: Path) -> dict[str, str]:
         "environment": _counted(item["env_id"] for item in metadata),
         "expert": _counted(item["expert"] for item in metadata),
         "success": f"{successes} of {len(metadata)} tried, {strict} by the strict condition",
-        "duration": f"{_spread(durations)} s, {sum(durations):.1f} s in all",
-        "completion time": f"{_spread(times)} s" if times else "–",
+        "duration": f"{mixture or _spread(durations)}; {sum(durations):.1f} s in all",
+        "completion time": (mixture or _spread(times)) if times else "–",
         "people": f"{len(subjects)}, in {len(clips)} clips",
         "cameras": _counted(_image_text(item) for item in metadata),
         "size": f"{size / 1e6:.1f} MB, {size / len(metadata) / 1e6:.2f} MB an episode",
@@ -103,10 +104,22 @@ def _counted(values: Any) -> str:
     return "; ".join(f"{value} ({number})" for value, number in counts)
 
 
+def _mixture(metadata: list[dict[str, Any]]) -> str:
+    """Return why episodes have no mean in common; empty if they do."""
+    for name in ("env_id", "expert", "control_period", "xml_hash"):
+        values = sorted({str(item[name]) for item in metadata})
+        if len(values) > 1:
+            return f"– (episodes differ in {name}: {', '.join(v[:40] for v in values)})"
+    return ""
+
+
 def _spread(values: list[float]) -> str:
-    """Format mean, sample standard deviation and range."""
-    deviation = stdev(values) if len(values) > 1 else 0.0
-    return f"{mean(values):.2f} ± {deviation:.2f} ({min(values):.2f} … {max(values):.2f})"
+    """Format mean, sample standard deviation and range of times in s."""
+    if len(values) == 1:
+        return f"{values[0]:.2f} s (one episode)"
+    deviation, n = stdev(values), len(values)
+    ends = f"{min(values):.2f} … {max(values):.2f}"
+    return f"{mean(values):.2f} ± {deviation:.2f} s (mean ± sd of {n}; {ends})"
 
 
 def main(args: Sequence[str]) -> int:

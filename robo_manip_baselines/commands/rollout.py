@@ -231,7 +231,9 @@ def record(options: RolloutOptions) -> None:
         "episodes": str(summary.episodes),
         "success": f"{summary.successes}/{summary.episodes}",
         "strict success": f"{summary.strict_successes}/{summary.episodes}",
-        "completion time": mean_and_sd(summary.completion_time_mean, summary.completion_time_sd),
+        "completion time": mean_and_sd(
+            summary.completion_time_mean, summary.completion_time_sd, summary.successes
+        ),
         "speed": "-" if rate is None else f"{rate:.0f} steps/s",
         "failed seeds": ", ".join(map(str, summary.failed_seeds)) or "-",
         "written to": str(collection.out),

@@ -24,6 +24,7 @@ from robo_manip_baselines.data.schema import POLICY_ATTRIBUTES
 from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import ObservationSpec, State
 from robo_manip_baselines.observation.corruption import NO_PREDICTION
+from robo_manip_baselines.observation.spec import size_text
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -185,8 +186,10 @@ def load_demonstrations(
     Args:
         folder: as ``bin/Rollout.py`` writes it; ``failed/`` is left out.
         spec: what to observe. Its corruption is applied to what is read, drawn from the seed of
-            each episode. An ``image_size`` smaller than the recorded one is met by shrinking images
-            as they are read; a larger one is refused, for it would add nothing.
+            each episode. An ``image_size`` smaller than the recorded one is met by `fit_image` as
+            images are read, and the size at which they were drawn becomes ``render_size``, so that
+            the policy is shown the same in rollouts; a larger one is refused, for it would add
+            nothing.
         limit: read only so many episodes, those of the lowest seeds; all of them if None.
         env: name of the task, for error messages; the folder's name if None.
 
@@ -201,6 +204,7 @@ def load_demonstrations(
     spec = replace(spec, corruption=spec.corruption.pinned())
     pipeline = spec.make_pipeline()
     paths = _episode_paths(env or folder.name, folder, spec, limit)
+    spec = _drawn_as_recorded(spec, read_metadata(paths[0]))
     states: list[NDArray[np.float32]] = []
     actions: list[NDArray[np.float32]] = []
     attributes: list[dict[str, Any]] = []
@@ -310,12 +314,45 @@ def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:
             f"'{path}' has no images of {', '.join(missing)}; its cameras: {there}; choose "
             f"--cameras {' '.join(recorded) or 'none'}, or record others: {line}"
         )
-    height, width = attributes["image_size"]
-    if spec.cameras and (spec.image_size[0] > height or spec.image_size[1] > width):
+    if not spec.cameras:
+        return
+    shown, recorded = spec.image_size, tuple(attributes["image_size"])
+    if shown[0] > recorded[0] or shown[1] > recorded[1]:
+        size = size_text(recorded)
         raise RequestError(
-            f"image size {spec.image_size[0]}x{spec.image_size[1]}: '{path}' holds "
-            f"{height}x{width}; choose --image_size {height}x{width} or less, or record: {line}"
+            f"image size {size_text(shown)}: '{path}' holds {size}; choose --image_size {size} or "
+            f"less, or record: {line}"
         )
+    drawn = _drawn_size(attributes)
+    if drawn != spec.drawn_size:
+        raise RequestError(
+            f"'{path}' holds images of {size_text(recorded)} drawn at {size_text(drawn)}, not "
+            f"{size_text(spec.drawn_size)}; keep episodes of one kind in one folder"
+        )
+    if drawn != recorded != shown:  # twice shrunk, which no environment does
+        raise RequestError(
+            f"image size {size_text(shown)}: the images in '{path}' were drawn at "
+            f"{size_text(drawn)} and shrunk to {size_text(recorded)}; choose --image_size "
+            f"{size_text(recorded)}, or record: {line}"
+        )
+
+
+def _drawn_as_recorded(spec: ObservationSpec, attributes: Mapping[str, Any]) -> ObservationSpec:
+    """Return a spec whose cameras are drawn as those of an episode were.
+
+    Unchanged where the episode cannot show what it asks for; `_require_spec` says why.
+    """
+    drawn = _drawn_size(attributes)
+    is_larger = spec.image_size[0] > drawn[0] or spec.image_size[1] > drawn[1]
+    if not spec.cameras or spec.render_size or is_larger:
+        return spec
+    return replace(spec, render_size=drawn)
+
+
+def _drawn_size(attributes: Mapping[str, Any]) -> tuple[int, int]:
+    """Return height and width at which the images of an episode were drawn."""
+    height, width = attributes["env_kwargs"].get("render_size") or attributes["image_size"]
+    return height, width
 
 
 def _world(attributes: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from robo_manip_baselines.observation.error_models import DRAWN_ERRORS, WORLD_FROM_IMAGE, Draw
 from robo_manip_baselines.observation.error_stats import load_error_stats
 from robo_manip_baselines.observation.state import FRAME_RATE, Floats, State, TargetObservation
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 
 MEASURED_ERRORS = tuple(DRAWN_ERRORS)
 """Errors of the forecast that are drawn from the statistics of a file."""
@@ -29,6 +29,12 @@ ERRORS = ("none", *MEASURED_ERRORS, "model")
 
 DROPOUT_LENGTH = 15.0
 """Default mean length of a loss of the face, frames: half a second."""
+
+MAX_DELAY = 10_000
+"""Frames, far longer than any episode."""
+
+MAX_SEED = 2**63 - 1
+"""Largest seed: the largest integer that an episode file holds."""
 
 NO_PREDICTION = (
     "no predicted mouth, which the error 'model' shows; use a motion library that "
@@ -86,8 +92,13 @@ class Corruption:
                 f"error_stats '{self.error_stats}' goes with the errors "
                 f"{', '.join(MEASURED_ERRORS)}, not with '{self.error}'; leave it out"
             )
-        if self.delay < 0:
-            raise RequestError(f"delay {self.delay}: must be 0 or more frames of 1/30 s")
+        if not isinstance(self.error_stats, str | None):
+            raise RequestError(f"error_stats {self.error_stats!r}: must be the path of a file")
+        require_integer("delay", self.delay, 0, MAX_DELAY, " frames of 1/30 s")
+        for name in ("face_dropout", "face_dropout_length", "detector_rate"):
+            value = getattr(self, name)
+            if not (_is_number(value) or (name == "detector_rate" and value is None)):
+                raise RequestError(f"{name} {value!r}: must be a number")
         length = self.face_dropout_length
         if not (math.isfinite(length) and length >= 1.0):
             raise RequestError(f"face_dropout_length {length:g}: must be 1 or more frames")
@@ -104,8 +115,7 @@ class Corruption:
                 f"detector_rate {rate:g}: must be above 0 and at most {FRAME_RATE:g} Hz, the "
                 "camera's; leave it out for a detection at every step"
             )
-        if self.seed < 0:
-            raise RequestError(f"seed {self.seed} of the corruption: must be 0 or more")
+        require_integer("seed of the corruption", self.seed, 0, MAX_SEED)
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Corruption:
@@ -353,6 +363,10 @@ def draw_lost(corruption: Corruption, rng: np.random.Generator, frames: int) -> 
     for frame, chance in enumerate(rng.random(frames).tolist()[1:], start=1):
         lost[frame] = chance >= 1.0 / length if lost[frame - 1] else chance < begins
     return lost
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
 def _stream(seed: int, episode: int, name: str) -> np.random.Generator:

@@ -3,7 +3,8 @@
 Legend: F video frames, H horizons, C = 2 H components in the order 1 U, 1 V, 2 U, ...; the last
 axis of (F, H, 2) is U, V: metres right and down in the image.
 
-Each function prepares what does not change from episode to episode, and returns what draws. Of F
+Each function prepares what does not change from episode to episode, and returns what draws: a
+partial function, which can be copied and pickled with its environment. Of F
 frames the first are the same as if fewer were drawn: what is needed is taken from the generator
 frame by frame. Adding an error is a function, a line in ``DRAWN_ERRORS`` and a name in
 ``corruption.MEASURED_ERRORS``.
@@ -12,6 +13,7 @@ frame by frame. Adding an error is a function, a line in ``DRAWN_ERRORS`` and a 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -42,8 +44,11 @@ def uniform(stats: ErrorStats) -> Draw:
     how long an error lasts: here it is that of one video frame, independent of the next and of
     other horizons.
     """
-    bound = stats.mean_abs
-    return lambda rng, frames: rng.uniform(-1.0, 1.0, (frames, *bound.shape)) * bound
+    return partial(_draw_uniform, stats.mean_abs)
+
+
+def _draw_uniform(bound: Floats, rng: np.random.Generator, frames: int) -> Floats:
+    return rng.uniform(-1.0, 1.0, (frames, *bound.shape)) * bound
 
 
 def gaussian(stats: ErrorStats) -> Draw:
@@ -57,18 +62,19 @@ def gaussian(stats: ErrorStats) -> Draw:
     # Which of two directions an axis has is up to the linear-algebra library.
     axes = axes * np.where(axes[np.abs(axes).argmax(axis=0), np.arange(len(axes))] < 0, -1.0, 1.0)
     gain = axes * np.sqrt(np.maximum(variance, 0.0))  # (C, C): component from axis
-    persistence = frame_persistence(stats, gain)
+    return partial(_draw_gaussian, stats.bias, gain, frame_persistence(stats, gain))
+
+
+def _draw_gaussian(
+    bias: Floats, gain: Floats, persistence: Floats, rng: np.random.Generator, frames: int
+) -> Floats:
     fresh = np.sqrt(1.0 - persistence**2)
-
-    def draw(rng: np.random.Generator, frames: int) -> Floats:
-        drawn = rng.standard_normal((frames, len(persistence)))
-        for frame in range(1, frames):
-            drawn[frame] = persistence * drawn[frame - 1] + fresh * drawn[frame]
-        # Not a matrix product, whose rounding may depend on the number of frames.
-        mixed = (drawn[:, None, :] * gain).sum(axis=-1)
-        return stats.bias + mixed.reshape(frames, *stats.bias.shape)
-
-    return draw
+    drawn = rng.standard_normal((frames, len(persistence)))
+    for frame in range(1, frames):
+        drawn[frame] = persistence * drawn[frame - 1] + fresh * drawn[frame]
+    # Not a matrix product, whose rounding may depend on the number of frames.
+    mixed = (drawn[:, None, :] * gain).sum(axis=-1)
+    return bias + mixed.reshape(frames, *bias.shape)
 
 
 def frame_persistence(stats: ErrorStats, gain: Floats) -> Floats:
@@ -101,28 +107,30 @@ def empirical(stats: ErrorStats) -> Draw:
             f"error statistics '{stats.source}' hold no residuals to play again; choose the error "
             "gaussian or uniform, or export the statistics with residuals"
         )
-    stride = stats.stride
-    length = -(-BLOCK_FRAMES // stride)
-    sizes = np.array([len(run) for run in stats.runs])
-    ends = np.cumsum(sizes)
-    pool = np.concatenate(stats.runs)
-    mean = pool.mean(axis=0)
+    length = -(-BLOCK_FRAMES // stats.stride)
     follow = _next_correlation(stats.runs) * (length - 1) / length  # none from block to block
+    return partial(_draw_empirical, stats.runs, stats.stride, follow)
 
-    def draw(rng: np.random.Generator, frames: int) -> Floats:
-        blocks = -(-(-(-frames // stride) + 1) // length)
-        place = rng.integers(ends[-1], size=blocks)
-        run = np.searchsorted(ends, place, side="right")
-        first = ends[run] - sizes[run]
-        steps = (place - first)[:, None] + np.arange(length)
-        known = (pool - mean)[(first[:, None] + steps % sizes[run][:, None]).ravel()]
-        before, part = np.divmod(np.arange(frames), stride)
-        late = (part / stride)[:, None, None]
-        mixed = (1.0 - late) * known[before] + late * known[before + 1]
-        kept = (1.0 - late) ** 2 + late**2 + 2.0 * late * (1.0 - late) * follow
-        return mean + mixed / np.sqrt(np.maximum(kept, np.finfo(float).tiny))
 
-    return draw
+def _draw_empirical(
+    runs: tuple[Floats, ...], stride: int, follow: Floats, rng: np.random.Generator, frames: int
+) -> Floats:
+    length = -(-BLOCK_FRAMES // stride)
+    sizes = np.array([len(run) for run in runs])
+    ends = np.cumsum(sizes)
+    pool = np.concatenate(runs)
+    mean = pool.mean(axis=0)
+    blocks = -(-(-(-frames // stride) + 1) // length)
+    place = rng.integers(ends[-1], size=blocks)
+    run = np.searchsorted(ends, place, side="right")
+    first = ends[run] - sizes[run]
+    steps = (place - first)[:, None] + np.arange(length)
+    known = (pool - mean)[(first[:, None] + steps % sizes[run][:, None]).ravel()]
+    before, part = np.divmod(np.arange(frames), stride)
+    late = (part / stride)[:, None, None]
+    mixed = (1.0 - late) * known[before] + late * known[before + 1]
+    kept = (1.0 - late) ** 2 + late**2 + 2.0 * late * (1.0 - late) * follow
+    return mean + mixed / np.sqrt(np.maximum(kept, np.finfo(float).tiny))
 
 
 def _next_correlation(runs: tuple[Floats, ...]) -> Floats:

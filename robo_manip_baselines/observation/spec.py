@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Annotated, Any
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -24,7 +25,7 @@ from robo_manip_baselines.observation.state import (
     State,
     TargetObservation,
 )
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 
 PRESETS = ("baseline", "current", "current_pred")
 """The paper's three observation groups (section IV.C)."""
@@ -53,6 +54,11 @@ def parse_image_size(size: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
+def size_text(size: Sequence[int]) -> str:
+    """Format height and width as the option takes them: ``480x640``."""
+    return f"{size[0]}x{size[1]}"
+
+
 ImageSize = Annotated[
     tuple[int, int],
     PrimitiveConstructorSpec(
@@ -60,7 +66,7 @@ ImageSize = Annotated[
         metavar="HEIGHTxWIDTH",
         instance_from_str=lambda args: parse_image_size(args[0]),
         is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=lambda value: [f"{value[0]}x{value[1]}"],
+        str_from_instance=lambda value: [size_text(value)],
     ),
 ]
 
@@ -88,6 +94,9 @@ class ObservationSpec:
         horizon: Frames of 1/30 s that current_pred looks ahead, 1 to 5.
         cameras: Cameras, any of top, angle and front_close, or none.
         image_size: Height and width of the images in pixels.
+        render_size: Height and width at which cameras are drawn before `fit_image` makes images of
+            ``image_size``; None draws at ``image_size``. Of a trained policy it is the size of its
+            demonstrations' images.
         object_pose: Show the positions of the task's objects.
         arms: Arms in state and action: right or both.
         corruption: Corruption of the target between simulator and policy.
@@ -100,26 +109,30 @@ class ObservationSpec:
     horizon: int = 2
     cameras: tuple[str, ...] = CAMERAS
     image_size: ImageSize = (480, 640)
+    render_size: tyro.conf.Suppress[ImageSize | None] = None
     object_pose: bool = False
     arms: str = "right"
     corruption: Corruption = field(default_factory=Corruption)
 
     def __post_init__(self) -> None:
-        # As command lines write them: "none", and commas in place of spaces.
-        cameras = tuple(name for part in self.cameras for name in part.split(",") if name)
-        object.__setattr__(self, "cameras", () if cameras == ("none",) else cameras)
+        object.__setattr__(self, "cameras", _camera_names(self.cameras))
         require_choice("observation preset", self.obs, PRESETS)
         require_choice("arms", self.arms, ARMS)
         for camera in self.cameras:
             require_choice("camera", camera, CAMERAS)
         if len(set(self.cameras)) != len(self.cameras):
             raise RequestError(f"cameras {', '.join(self.cameras)}: each may be named once")
-        if not 1 <= self.horizon <= MAX_HORIZON:
-            raise RequestError(f"horizon {self.horizon}: must be 1 to {MAX_HORIZON} frames")
-        size = self.image_size
-        if len(size) != 2 or not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
+        horizon = require_integer("horizon", self.horizon, 1, MAX_HORIZON, " frames")
+        object.__setattr__(self, "horizon", horizon)
+        if not isinstance(self.object_pose, bool | np.bool_):
+            raise RequestError(f"object_pose {self.object_pose!r}: must be True or False")
+        object.__setattr__(self, "object_pose", bool(self.object_pose))
+        object.__setattr__(self, "image_size", _checked_size("image size", self.image_size))
+        self._check_render_size()
+        if not isinstance(self.corruption, Corruption):
             raise RequestError(
-                f"image size {size}: must be height and width, 1 to {MAX_IMAGE_SIZE}"
+                f"corruption {self.corruption!r}: must be a Corruption, or a dict of its settings, "
+                "for example {'error': 'uniform'}"
             )
         if not self.corruption:
             object.__setattr__(self, "corruption", Corruption())
@@ -135,11 +148,25 @@ class ObservationSpec:
                 "(delay, face_dropout and detector_rate go with 'current', too)"
             )
 
+    def _check_render_size(self) -> None:
+        """Check ``render_size``; the same as ``image_size`` becomes None."""
+        if self.render_size is None:
+            return
+        drawn, shown = _checked_size("render size", self.render_size), self.image_size
+        object.__setattr__(self, "render_size", None if drawn == shown else drawn)
+        if shown[0] > drawn[0] or shown[1] > drawn[1]:
+            raise RequestError(
+                f"image size {size_text(shown)}: must be no larger than the render size "
+                f"{size_text(drawn)} in either direction"
+            )
+
     # -- other forms ----------------------------------------------------------------------------
 
     def to_json(self) -> dict[str, Any]:
-        """Return what JSON can hold; without a corruption as releases before there was one."""
+        """Return what JSON can hold; what is not set is left out, as in files of older releases."""
         values = asdict(self)
+        if self.render_size is None:
+            del values["render_size"]
         arms, corruption = values.pop("arms"), values.pop("corruption")
         values |= {"error": self.corruption.error, "arms": arms}
         return values | {"corruption": corruption} if self.corruption else values
@@ -171,6 +198,11 @@ class ObservationSpec:
         horizon = f"_h{self.horizon}" if self.obs == "current_pred" else ""
         corruption = f"_{self.corruption.label}" if self.corruption else ""
         return f"{self.obs}{horizon}{corruption}"
+
+    @property
+    def drawn_size(self) -> tuple[int, int]:
+        """Height and width at which cameras are drawn."""
+        return self.render_size or self.image_size
 
     # -- content --------------------------------------------------------------------------------
 
@@ -254,6 +286,38 @@ class ObservationSpec:
             return vector[None, start : start + 3].astype(np.float64)
         timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
         return timed[:, 1:].astype(np.float64)
+
+
+def _camera_names(given: object) -> tuple[str, ...]:
+    """Return the names of cameras: one name, several, and as command lines write them.
+
+    That is ``none`` for no camera, and commas in place of spaces.
+    """
+    names = [given] if isinstance(given, str) else given
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise RequestError(
+            f"cameras {given!r}: must be names of cameras, or () for none; valid: "
+            f"{', '.join(CAMERAS)}"
+        )
+    cameras = tuple(name.strip() for part in names for name in part.split(",") if name.strip())
+    return () if cameras == ("none",) else cameras
+
+
+def _checked_size(what: str, given: object) -> tuple[int, int]:
+    """Return height and width as integers.
+
+    Raises:
+        RequestError: they are no two numbers from 1 to ``MAX_IMAGE_SIZE``.
+    """
+    sides = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
+    try:
+        height, width = (require_integer(what, side, 1, MAX_IMAGE_SIZE) for side in sides)
+    except ValueError:
+        raise RequestError(
+            f"{what} {given!r}: must be height and width, two whole numbers from 1 to "
+            f"{MAX_IMAGE_SIZE}, for example (240, 320)"
+        ) from None
+    return height, width
 
 
 def _state_names(arms: Sequence[str]) -> list[str]:

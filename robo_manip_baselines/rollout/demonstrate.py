@@ -347,12 +347,6 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     Raises:
         RequestError: naming the first setting that differs.
     """
-    done = sorted(finished_seeds(collection.out))
-    present = next((path for seed in done if (path := collection.path(seed))), None)
-    if present is None:
-        return
-    recorded = read_metadata(present)
-    there = {**recorded, "env_kwargs": without_library_path(recorded["env_kwargs"])}
     wanted = {
         "env_id": task_entry(collection.env).env_id,
         "env_kwargs": without_library_path(collection.env_kwargs),
@@ -361,12 +355,17 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
         "image_quality": collection.quality,
         "xml_hash": xml_hash,
     }
-    for name, value in wanted.items():
-        if there[name] != value:
-            raise RequestError(
-                f"'{collection.out}' holds episodes with {name} {there[name]}, not {value}; "
-                "give another --out or remove that folder"
-            )
+    for seed in sorted(finished_seeds(collection.out)):
+        if (path := collection.path(seed)) is None:
+            continue
+        recorded = read_metadata(path)
+        there = {**recorded, "env_kwargs": without_library_path(recorded["env_kwargs"])}
+        for name, value in wanted.items():
+            if there[name] != value:
+                raise RequestError(
+                    f"'{collection.out}' holds episodes with {name} {there[name]}, not {value} "
+                    f"({path.name}); give another --out or remove that folder"
+                )
 
 
 @dataclass(frozen=True)

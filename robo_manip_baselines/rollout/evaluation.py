@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +19,14 @@ from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, pin_libr
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import Corruption
-from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model, read_checkpoint
+from robo_manip_baselines.policy.checkpoint import (
+    Checkpoint,
+    load_model,
+    read_checkpoint,
+    without_initial_weights,
+)
 from robo_manip_baselines.policy.presets import ActionExecution, require_at_least
+from robo_manip_baselines.rollout.agreement import require_continuation
 from robo_manip_baselines.rollout.results import (
     SUMMARY,
     EpisodeResult,
@@ -216,6 +224,42 @@ class EvaluationPlan:
             "precision": self.config.precision,
         }
 
+    @cached_property
+    def origin(self) -> dict[str, Any]:
+        """Fields of a result row that all results of the evaluation share, ready for JSON."""
+        checkpoint, spec, kwargs = self.checkpoint, self.env.spec, dict(self.env.env_kwargs)
+        # A library is what it holds, wherever it lies.
+        library = MotionLibrary.load(kwargs.pop("motion_library", None))
+        kwargs.pop("motion_sha256", None)
+        shows_prediction = spec.corruption.error == "model"
+        training = {
+            "network": asdict(without_initial_weights(checkpoint.config)),
+            "settings": asdict(checkpoint.settings),
+            "step": checkpoint.step,
+            "demonstrations": checkpoint.dataset.get("content_hash"),
+        }
+        settings = {
+            "env_kwargs": kwargs,
+            "motion": library.motion_sha256,
+            "prediction": library.prediction_sha256 if shows_prediction else None,
+            "xml_hash": checkpoint.xml_hash,
+            "execution": self.settings["acting"],
+            "precision": self.config.precision,
+            "device": self.device.type,
+            "training": hashlib.sha256(json.dumps(training, default=str).encode()).hexdigest(),
+        }
+        origin = {
+            "env": self.env.env,
+            "policy": checkpoint.policy,
+            "condition": self.condition,
+            "observation": spec.to_json(),
+            "train_seed": checkpoint.train_seed,
+            "checkpoint": checkpoint.content_hash,
+            "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),
+            "settings": settings,
+        }
+        return json.loads(json.dumps(origin))
+
     @property
     def facts(self) -> dict[str, Any]:
         """Further facts that are recorded beside results."""
@@ -245,15 +289,6 @@ class EvaluationPlan:
             return
         checkpoint, successes = self.checkpoint, 0
         num_envs, longest = min(self.config.num_envs, len(seeds)), self.env.task.max_episode_steps
-        origin: dict[str, Any] = {
-            "policy": checkpoint.policy,
-            "condition": self.condition,
-            "observation": json.loads(json.dumps(self.env.spec.to_json())),
-            "train_seed": checkpoint.train_seed,
-            "checkpoint": checkpoint.content_hash,
-            "motion_sha256": MotionLibrary.load(self.env.env_kwargs.get("motion_library")).sha256,
-            "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),
-        }
         with (
             self._one_thread_if_small(),
             open_envs(self.env, num_envs, self.config.workers) as envs,
@@ -263,7 +298,7 @@ class EvaluationPlan:
             def finished(result: EpisodeResult, recording: Recording) -> None:
                 nonlocal successes
                 successes += result.is_success
-                on_episode(replace(result, **origin), recording)
+                on_episode(replace(result, **self.origin), recording)
                 progress.note = f"{successes} succeeded"
                 progress.end(result.steps)
 
@@ -310,6 +345,8 @@ def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummar
         )
     recordings: dict[int, Recording] = {}
     with open_results(plan.out, plan.settings, plan.facts) as file:
+        # Settings may be the same and other things not: the release, or rows from elsewhere.
+        require_continuation(plan.out, file.done.values(), plan.origin)
         todo = [seed for seed in seeds if seed not in file.done]
         if len(todo) < len(seeds):
             logger.info("%d of %d episodes are there already", len(seeds) - len(todo), len(seeds))

@@ -20,12 +20,14 @@ from typing import Any, TextIO
 import numpy as np
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
+from robo_manip_baselines.rollout.agreement import require_one_evaluation
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import prepare_folder, read_json, write_json, write_text
 from robo_manip_baselines.runs.progress import closing_table
 
-ROW_VERSION = 2
-"""of a row; version 1 named the condition ``arm`` and did not hold the observation spec."""
+ROW_VERSION = 3
+"""of a row; version 1 named the condition ``arm`` and did not hold the observation spec, and
+version 2 did not hold the settings of the evaluation."""
 
 SCHEMA = "robo_manip_baselines/evaluation"
 SCHEMA_VERSION = 1
@@ -58,8 +60,11 @@ class EpisodeResult:
         observation: spec of what the policy was shown, as JSON; null in rows of version 1
         train_seed: seed of the training run; null for a policy that was not trained
         checkpoint: hash of the checkpoint's contents
-        motion_sha256: SHA-256 of the library of recorded motion; empty in rows of older releases
         versions: of the software
+        settings: further settings that decide results: ``env_kwargs``, digests of the recorded
+            ``motion`` and, if the policy observes it, of a ``prediction``, ``xml_hash``,
+            ``execution`` of action chunks, ``precision``, ``device`` and a digest of the
+            ``training``; null in rows of versions 1 and 2
     """
 
     env: str
@@ -77,8 +82,8 @@ class EpisodeResult:
     observation: dict[str, Any] | None = None
     train_seed: int | None = None
     checkpoint: str = ""
-    motion_sha256: str = ""
     versions: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, Any] | None = None
 
     def to_line(self) -> str:
         """Return the row as one line of JSON, without the line's end."""
@@ -88,7 +93,7 @@ class EpisodeResult:
 
     @classmethod
     def from_line(cls, line: str) -> EpisodeResult:
-        """Read a row of this version or of version 1.
+        """Read a row of this version or of an earlier one.
 
         Raises:
             ValueError: it is no such row; the message says what is wrong with it.
@@ -97,13 +102,14 @@ class EpisodeResult:
         if not isinstance(values, dict):
             raise ValueError("it is no JSON object")
         version = values.pop("version", 1)
-        if version == 1:
+        if version not in range(1, ROW_VERSION + 1):
+            raise ValueError(f"'version' is {version}; this release reads 1 to {ROW_VERSION}")
+        if version < 3:
+            values.setdefault("settings", None)
+        if version < 2:
             values.setdefault("observation", None)
             if "arm" in values:
                 values["condition"] = values.pop("arm")
-        elif version != ROW_VERSION:
-            raise ValueError(f"'version' is {version}; this release reads 1 and {ROW_VERSION}")
-        values.setdefault("motion_sha256", "")
         hints = typing.get_type_hints(cls)
         hints.pop("columns")
         given = {name: _checked(values, name, hint) for name, hint in hints.items()}
@@ -339,7 +345,12 @@ class EvaluationSummary:
 def summarize(
     task: TaskEntry, results: Sequence[EpisodeResult], *, new: int, seconds: float
 ) -> EvaluationSummary:
-    """Summarize the results of all episodes, of which this run made ``new`` in ``seconds``."""
+    """Summarize the results of all episodes, of which this run made ``new`` in ``seconds``.
+
+    Raises:
+        RequestError: they are not all of one evaluation.
+    """
+    require_one_evaluation(results)
     total, limit = len(results), task.success_time_limit
     times = [r.completion_time for r in results if r.completion_time is not None]
     mean, sd = completion_time(times)
@@ -381,7 +392,9 @@ def summary_table(task: TaskEntry, summary: EvaluationSummary, facts: dict[str, 
         proportions[f"success in {task.success_time_limit:g} s"] = summary.success_within_limit
     rows = {"episodes": str(total)}
     rows |= {name: f"{part.count}/{total}  {part}" for name, part in proportions.items()}
-    rows["completion time"] = mean_and_sd(summary.completion_time_mean, summary.completion_time_sd)
+    rows["completion time"] = mean_and_sd(
+        summary.completion_time_mean, summary.completion_time_sd, summary.success.count
+    )
     for name, values in summary.columns.items():
         label = name.replace("_", " ")
         rows[label] = f"{values['median']:.4g} (median), {values['max']:.4g} (max)"
@@ -393,8 +406,13 @@ def summary_table(task: TaskEntry, summary: EvaluationSummary, facts: dict[str, 
     return closing_table(rows)
 
 
-def mean_and_sd(mean: float | None, sd: float | None) -> str:
-    """Format a mean time with its standard deviation: ``5.69 ± 0.96 s``."""
+def mean_and_sd(mean: float | None, sd: float | None, successes: int) -> str:
+    """Format a mean time with its sample standard deviation over successes.
+
+    ``5.69 ± 0.96 s (mean ± sd of 84 successes)``.
+    """
     if mean is None:
         return "-"
-    return f"{mean:.2f} s" if sd is None else f"{mean:.2f} ± {sd:.2f} s"
+    if sd is None:
+        return f"{mean:.2f} s (one success)"
+    return f"{mean:.2f} ± {sd:.2f} s (mean ± sd of {successes} successes)"

@@ -52,10 +52,10 @@ TRACK_STEPS = 100
 VIEW_SIZE = (360, 480)
 """Height and width of each camera's view in pixels: three of them fit a screen."""
 
-PLAIN = {"image_size": VIEW_SIZE}
+PLAIN = {"image_size": VIEW_SIZE, "render_size": None}
 """Arguments of an environment whose images are for a preview: they look as recorded ones."""
 
-LOOK = {"image_size": VIEW_SIZE, "shadows": True, "multisamples": 4}
+LOOK = {**PLAIN, "shadows": True, "multisamples": 4}
 """Arguments of an environment whose images are for people."""
 
 THREADS = 2

@@ -17,7 +17,7 @@ import yaml
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
-from robo_manip_baselines.observation.spec import parse_image_size
+from robo_manip_baselines.observation.spec import parse_image_size, size_text
 from robo_manip_baselines.policy.presets import (
     ActionExecution,
     TrainSettings,
@@ -146,9 +146,10 @@ class TrainConfig(Generic[Network]):
         values = {name: value for name, value in vars(self).items() if name not in _PARTS}
         for part in _PARTS:
             values |= vars(getattr(self, part))
+        del values["render_size"]  # no option: demonstrations have it
         corruption = values.pop("corruption")
         values |= {name: getattr(corruption, of) for name, of in _CORRUPTION.items()}
-        values["image_size"] = "{}x{}".format(*self.spec.image_size)
+        values["image_size"] = size_text(self.spec.image_size)
         return {name: _plain(value) for name, value in values.items()}
 
     @classmethod

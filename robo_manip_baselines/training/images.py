@@ -13,12 +13,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.episode import EpisodeFileError, EpisodeReader
+from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import decode_image
 from robo_manip_baselines.runs.progress import track
@@ -33,7 +33,10 @@ UNKNOWN_MEMORY = 4 * 2**30
 
 
 class ImageStore(AbstractContextManager["ImageStore"]):
-    """Images of steps, in the order of ``spec.cameras``, at the size ``spec.image_size``.
+    """Images of steps, in the order of ``spec.cameras``, as the environment shows them.
+
+    Recorded images of the size ``spec.drawn_size`` become ones of ``spec.image_size`` by
+    `fit_image`, which the environment applies to what it draws.
 
     Images that fit into ``memory_budget`` are decoded once and held. Otherwise each is read from
     its file, which stays open, and decoded when it is needed. A pool of threads does the decoding.
@@ -146,17 +149,6 @@ class ImageStore(AbstractContextManager["ImageStore"]):
         for _ in track(done, len(numbers), "episode", "decoding images"):
             pass
         return held
-
-
-def fit_image(image: Images, size: tuple[int, int]) -> Images:
-    """Shrink an (H, W, 3) image to ``size``, height and width, each pixel the mean of its area.
-
-    An image of that size already is returned as it is.
-    """
-    if image.shape[:2] == tuple(size):
-        return image
-    small = cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA)
-    return np.asarray(small, dtype=np.uint8)
 
 
 def free_memory() -> int:

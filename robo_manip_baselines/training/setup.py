@@ -17,6 +17,7 @@ from robo_manip_baselines.data.demonstrations import (
 )
 from robo_manip_baselines.data.normalization import METHODS, Normalization
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation.spec import size_text
 from robo_manip_baselines.policy.checkpoint import (
     Checkpoint,
     read_checkpoint,
@@ -159,7 +160,15 @@ class TrainSetup:
                 f"the demonstrations in '{self.config.demonstrations}' are not the ones that "
                 f"'{run}' was trained on; give those with --dataset, or choose another --out"
             )
-        if checkpoint.spec != self.demonstrations.spec:
+        trained, spec = checkpoint.spec, self.demonstrations.spec
+        if trained.drawn_size != spec.drawn_size:  # of a release that squashed images
+            raise RequestError(
+                f"'{run}' was trained on images of {size_text(trained.image_size)} drawn at "
+                f"{size_text(trained.drawn_size)}, and this release would go on with images drawn "
+                f"at {size_text(spec.drawn_size)}; choose another --out, or the release that "
+                "trained it"
+            )
+        if trained != spec:
             raise RequestError(
                 f"the error statistics are not the ones that '{run}' was trained with; give those "
                 "with --error_stats, or choose another --out"

@@ -184,23 +184,6 @@ def test_reference(make_rows: MakeRows) -> None:
     assert renamed.conditions[1].condition.label == "Blind"
 
 
-def test_seeds_that_not_all_have(make_rows: MakeRows) -> None:
-    rows = make_rows(conditions=["baseline", "current"], train_seeds=2, episodes=10)
-    kept = tuple(
-        row
-        for row in rows
-        if (row.result.condition, row.result.train_seed, row.result.seed)
-        not in {("baseline", 1, 1003), ("baseline", 0, 1004), ("current", 0, 1007)}
-        and (row.result.condition != "current" or row.result.seed < 1009)
-    )
-    statistics = analyze(kept, task=TASK, resamples=50)
-    assert statistics.seeds == (1000, 1001, 1002, 1005, 1006, 1008)
-    baseline = statistics.of("baseline")
-    assert baseline.outcomes.episodes == 18
-    # 2 · 9 common cells, less the three that one of the conditions lacks.
-    assert baseline.success_difference.difference.n == 15
-
-
 def test_conditions_without_a_common_training_seed(make_rows: MakeRows) -> None:
     rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=5)
     apart = tuple(row for row in rows if row.result.condition == "current") + change(

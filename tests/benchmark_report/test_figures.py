@@ -158,7 +158,7 @@ def test_little_is_drawn_too(make_rows: MakeRows) -> None:
 
 def test_a_task_with_kinds_of_failure_of_its_own(make_rows: MakeRows) -> None:
     """A task without a study has the figures that every task has; its kinds may be many."""
-    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=40)
+    rows = make_rows(conditions=["baseline"], train_seeds=1, episodes=40)
     kinds = {f"kind_{number}": "a failure" for number in range(9)}
     failed = [row for row in rows if not row.result.is_success]
     named = [

@@ -64,13 +64,22 @@ def test_info_counts_what_is_there(folder: Path) -> None:
     assert rows["environment"] == "robo_manip_baselines/FeedingEnv-v0"
     assert rows["success"] == "3 of 4 tried, 1 by the strict condition"
     # 10, 11, 12 and 13 steps of 0.02 s; their sample deviation is 0.02 · sqrt(5 / 3).
-    assert rows["duration"] == "0.23 ± 0.03 (0.20 … 0.26) s, 0.9 s in all"
-    assert rows["completion time"] == "4.33 ± 1.53 (3.00 … 6.00) s"
+    assert rows["duration"] == "0.23 ± 0.03 s (mean ± sd of 4; 0.20 … 0.26); 0.9 s in all"
+    assert rows["completion time"] == "4.33 ± 1.53 s (mean ± sd of 3; 3.00 … 6.00)"
     assert rows["people"] == "2, in 3 clips"
     assert rows["cameras"] == "front_close, top (24x32 jpeg 90)"
     done = dataset("info", folder)
     assert done.returncode == 0
     assert all(value in done.stdout for value in rows.values())
+
+
+def test_info_takes_no_mean_over_a_mixture(folder: Path) -> None:
+    path = episode_path(folder, 9, True)
+    write_episode(path, make_arrays(10), make_images(10), make_attributes(9) | {"expert": "other"})
+    rows = dataset_info(folder)
+    for name in ("duration", "completion time"):
+        assert "differ in expert: " in rows[name]
+        assert "±" not in rows[name]
 
 
 @pytest.mark.parametrize("command", ["verify", "info"])

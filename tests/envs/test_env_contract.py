@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import copy
+import pickle
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium
@@ -185,6 +187,108 @@ def test_actions_are_bounded_and_checked(env: gymnasium.Env[Any, Any]) -> None:
         env.unwrapped.step(np.zeros(3))
 
 
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([0.0, 0.0, np.nan, 0.0, 0.0, 0.0, 0.0], "nan in element 2, right/elbow: must be"),
+        ([0.0, -np.inf, 0.0, 0.0, 0.0, 0.0, 0.0], "-inf in element 1, right/shoulder: must be"),
+        (np.zeros((1, 7)), r"shape \(1, 7\): must be \(7,\) finite numbers"),
+        (0.0, r"shape \(\): must be"),
+        (None, "action None: must be"),
+        ("up", "action 'up': must be"),
+        ([[0.0], [0.0, 0.0]], "action .*: must be"),
+        (np.zeros(7, complex), "action .*: must be"),
+    ],
+)
+def test_wrong_actions_get_one_clear_line(name: str, action: Any, message: str) -> None:
+    with contextlib.closing(make_env(name, cameras=())) as env:
+        env.reset(seed=0)
+        before = env.unwrapped.data.qpos.copy()
+        with pytest.raises(ValueError, match=message) as caught:
+            env.unwrapped.step(action)
+        assert "\n" not in str(caught.value)
+        np.testing.assert_array_equal(env.unwrapped.data.qpos, before)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.0, "3", True, 2**63, np.int64(-1), [1]])
+def test_wrong_seeds_are_refused(name: str, seed: Any) -> None:
+    with (
+        contextlib.closing(make_env(name, cameras=())) as env,
+        pytest.raises(RequestError, match=r"^seed .*: must be 0 to 9223372036854775807"),
+    ):
+        env.reset(seed=seed)
+
+
+def test_integers_of_numpy_are_seeds(name: str) -> None:
+    with contextlib.closing(make_env(name, cameras=())) as env:
+        first, _ = env.reset(seed=3)
+        for seed in (np.int64(3), np.uint8(3)):
+            again, _ = env.reset(seed=seed)  # type: ignore[arg-type]
+            np.testing.assert_array_equal(again["state"], first["state"])
+            np.testing.assert_array_equal(env.unwrapped.vector, first["state"])
+        env.reset(seed=2**63 - 1)
+
+
+def test_options_of_an_episode_are_not_ignored(name: str) -> None:
+    with contextlib.closing(make_env(name, cameras=())) as env:
+        env.reset(seed=0, options={})
+        with pytest.raises(RequestError, match=r"^reset option clip, x: unknown"):
+            env.reset(seed=0, options={"clip": "clm_cap12", "x": 1})
+
+
+def test_use_before_reset_and_after_close_says_so(name: str) -> None:
+    env = make_env(name, cameras=(), render_mode="rgb_array")
+    action, world = env.action_space.sample(), env.unwrapped
+    for use in (lambda: env.step(action), lambda: world.step(action), world.render):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+            use()
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    for use in (env.reset, lambda: env.step(action), world.render):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="after close"):
+            use()
+
+
+COPIES: dict[str, Callable[[Any], Any]] = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+}
+
+
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("error", ["none", "uniform", "gaussian", "empirical"])
+def test_a_copy_goes_on_as_the_original_does(name: str, how: str, error: str) -> None:
+    corruption = {"error": error, "delay": 2, "face_dropout": 0.2}
+    env = make_env(name, cameras=(), obs="current_pred", corruption=corruption)
+    wander(env, seed=2, steps=3)
+    twin = COPIES[how](env)
+    for _ in range(3):
+        action = env.action_space.sample()
+        ours, theirs = env.step(action), twin.step(action)
+        np.testing.assert_array_equal(ours[0]["prediction"], theirs[0]["prediction"])
+        np.testing.assert_array_equal(ours[0]["state"], theirs[0]["state"])
+    env.close()
+    np.testing.assert_array_equal(twin.reset()[0]["state"].shape, ours[0]["state"].shape)
+    twin.close()
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("how", COPIES)
+def test_a_copy_draws_with_a_context_of_its_own(name: str, how: str) -> None:
+    env = make_env(name, cameras="top", image_size=(24, 32), render_size=(48, 64))
+    env.reset(seed=2)
+    twin = COPIES[how](env)
+    action = env.action_space.sample()
+    ours, theirs = env.step(action)[0], twin.step(action)[0]
+    env.close()
+    np.testing.assert_array_equal(ours["images/top"], theirs["images/top"])
+    assert theirs["images/top"].std() > 10
+    again = twin.step(action)[0]["images/top"]
+    assert again.shape == (24, 32, 3)
+    twin.close()
+
+
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_vector_environments_give_what_single_ones_give(name: str, mode: str) -> None:
     options: dict[str, Any] = {"cameras": (), "obs": "current"}
@@ -211,17 +315,44 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
     ("arguments", "message"),
     [
         ({"obs": "currant"}, "unknown observation preset 'currant' .*did you mean 'current'"),
+        ({"obs": 3}, "unknown observation preset '3'; valid: baseline"),
         ({"cameras": ("wrist",)}, "unknown camera 'wrist'.*valid: angle, front_close, top"),
+        ({"cameras": "wrist"}, "unknown camera 'wrist'.*valid: angle, front_close, top"),
         ({"cameras": ("top", "top")}, "each may be named once"),
+        ({"cameras": None}, "cameras None: must be names of cameras.*valid: top, angle"),
+        ({"cameras": [1]}, r"cameras \[1\]: must be names of cameras"),
         ({"horizon": 0}, "horizon 0: must be 1 to 5"),
         ({"horizon": 6}, "horizon 6: must be 1 to 5"),
+        ({"horizon": "2"}, "horizon '2': must be 1 to 5"),
+        ({"horizon": 2.5}, "horizon 2.5: must be 1 to 5"),
         ({"image_size": (0, 640)}, "image size"),
+        ({"image_size": 240}, r"image size 240: must be height and width.*\(240, 320\)"),
+        ({"image_size": (240.5, 320)}, "image size .*two whole numbers from 1 to 4096"),
+        ({"image_size": (240, 320, 3)}, "image size .*two whole numbers"),
+        ({"render_size": (240, 320)}, "image size 480x640: must be no larger than .* 240x320"),
+        ({"render_size": "big"}, "render size 'big': must be height and width"),
+        ({"object_pose": "yes"}, "object_pose 'yes': must be True or False"),
         ({"corruption": {"error": "cosmic"}}, "unknown error model 'cosmic'"),
         ({"corruption": {"delay": 3}}, "shows nothing"),
+        ({"corruption": "uniform"}, r"corruption 'uniform': .*\{'error': 'uniform'\}"),
+        ({"corruption": ["uniform"]}, r"corruption \['uniform'\]: .*\{'error': 'uniform'\}"),
+        ({"corruption": {"delay": "3"}}, "delay '3': must be 0 to"),
+        ({"corruption": {"delay": float("nan")}}, "delay nan: must be 0 to"),
+        ({"corruption": {"face_dropout": "a"}}, "face_dropout 'a': must be a number"),
+        ({"corruption": {"seed": 1.5}}, "seed of the corruption 1.5: must be 0 to"),
+        ({"corruption": {"sped": 1}}, "unknown setting of the corruption 'sped'"),
         ({"arms": "left"}, "unknown arms 'left'; valid: both, right"),
+        ({"arms": None}, "unknown arms 'None'; valid: both, right"),
         ({"face_motion": "never"}, "unknown face motion 'never'"),
         ({"clips": ("nobody",)}, "unknown clip 'nobody'"),
+        ({"clips": "nobody"}, "unknown clip 'nobody'"),
+        ({"clips": ()}, r"clips \(\): must be ids of clips, at least one"),
         ({"motion_library": "nowhere.npz"}, "'nowhere.npz' does not exist"),
+        ({"motion_library": 5}, "motion_library 5: must be the path of a file"),
+        ({"shadows": "yes"}, "shadows 'yes': must be True or False"),
+        ({"multisamples": 10**9}, "multisamples 1000000000: must be 0 to 64"),
+        ({"camera": "top"}, "unknown argument 'camera' .*'cameras'.*valid: arms, cameras, clips"),
+        ({"colour": "red"}, "unknown argument 'colour'; valid: arms, cameras, clips"),
     ],
 )
 def test_bad_arguments_get_one_clear_line(
@@ -230,6 +361,14 @@ def test_bad_arguments_get_one_clear_line(
     with pytest.raises(RequestError, match=message) as caught:
         make_env(name, **{"cameras": (), **arguments}).unwrapped  # noqa: B018
     assert "\n" not in str(caught.value)
+    assert isinstance(caught.value, ValueError)
+
+
+def test_one_name_is_a_list_of_one(name: str) -> None:
+    with contextlib.closing(make_env(name, cameras="top", clips="clm_cap12")) as env:
+        assert env.unwrapped.observation_spec.cameras == ("top",)
+        assert set(env.observation_space.spaces) == {"state", "images/top"}
+        assert env.unwrapped.clips == ("clm_cap12",)
 
 
 def test_unknown_environments_are_named() -> None:

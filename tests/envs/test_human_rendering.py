@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import pytest
 
+from robo_manip_baselines.envs.mujoco.tasks import face_env
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
@@ -40,6 +41,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[FakeViewer]:
 
     fake = SimpleNamespace(launch_passive=launch_passive)
     monkeypatch.setattr(mujoco, "viewer", fake, raising=False)
+    monkeypatch.setattr(face_env, "viewer_problem", lambda: None)
     return viewers
 
 
@@ -66,6 +68,20 @@ def test_no_viewer_without_being_asked_for(opened: list[FakeViewer]) -> None:
     env.step(env.action_space.sample())
     env.close()
     assert opened == []
+
+
+@pytest.mark.parametrize(
+    ("display", "problem"), [("", r"no display \(\$DISPLAY is not set\)"), (":9999", "no window")]
+)
+def test_without_a_display_one_line_says_so_before_anything_is_made(
+    monkeypatch: pytest.MonkeyPatch, display: str, problem: str
+) -> None:
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(face_env, "build_cell", None)
+    with pytest.raises(RequestError, match=f"^render mode 'human': {problem}.*rgb_array") as caught:
+        make_env("FeedingEnv", cameras=(), render_mode="human")
+    assert "\n" not in str(caught.value)
 
 
 def test_an_unknown_mode_is_refused() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -62,6 +62,21 @@ def test_the_same_network_twice_for_a_fold_is_refused_by_name() -> None:
     twice = loaded(("a", 2, "cpu"), ("a", 2, "cpu"), ("a", 2, "paper"), folders=("one", "two"))
     with pytest.raises(RequestError, match=r"one and two are both a \(cpu\) for test fold 2"):
         group_networks(twice)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"training": {"steps": 9}}, "training steps 20 and 9"),
+        ({"settings": {"width": 1}}, "settings steps 20 and None|settings width None and 1"),
+    ],
+)
+def test_folds_of_other_settings_are_no_row(part: dict[str, dict[str, int]], message: str) -> None:
+    same = {"settings": {"steps": 20}, "training": {"steps": 20}}
+    one, other = loaded(("a", 0, "cpu"), ("a", 1, "cpu"), folders=("one", "two"))
+    group_networks([replace(one, shared=same), replace(other, shared=same)])
+    with pytest.raises(RequestError, match=f"one and two are both a, with .*({message})"):
+        group_networks([replace(one, shared=same), replace(other, shared={**same, **part})])
 
 
 def test_networks_without_a_common_fold_are_refused() -> None:

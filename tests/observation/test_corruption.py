@@ -22,7 +22,7 @@ from robo_manip_baselines.runs.errors import RequestError
         ({"error": "unifrom"}, "unknown error model 'unifrom' .*did you mean 'uniform'"),
         ({"error_stats": "x.json"}, "error_stats 'x.json' goes with the errors uniform, gaussian"),
         ({"error": "model", "error_stats": "x.json"}, "not with 'model'"),
-        ({"delay": -1}, "delay -1: must be 0 or more"),
+        ({"delay": -1}, "delay -1: must be 0 to 10000 frames"),
         ({"face_dropout": -0.1}, "face_dropout -0.1: must be 0 to 0.938"),
         ({"face_dropout": 0.94}, "face_dropout 0.94: must be 0 to 0.938.*losses of 15 frames"),
         ({"face_dropout": 0.6, "face_dropout_length": 1.0}, "must be 0 to 0.5"),
@@ -32,7 +32,7 @@ from robo_manip_baselines.runs.errors import RequestError
         ({"detector_rate": 0.0}, "detector_rate 0: must be above 0 and at most 30"),
         ({"detector_rate": 31.0}, "detector_rate 31"),
         ({"detector_rate": float("nan")}, "detector_rate nan"),
-        ({"seed": -1}, "seed -1 of the corruption"),
+        ({"seed": -1}, "seed of the corruption -1"),
     ],
 )
 def test_invalid_settings_get_one_line(values: dict[str, Any], message: str) -> None:

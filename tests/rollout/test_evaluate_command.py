@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -98,6 +99,28 @@ def test_results_of_another_execution_are_not_mixed(run_folder: Path, tmp_path: 
     evaluate(config(run_folder, "--num_episodes 1 --execute 3", out=tmp_path))
     with pytest.raises(RequestError, match="holds results with acting"):
         evaluate(config(run_folder, "--num_episodes 1", out=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"checkpoint": "e" * 64}, "results with checkpoint e{12} .seed 1001., not [0-9a-f]{12};"),
+        ({"condition": "current"}, "results with condition current .*, not current_pred_h2"),
+        ({"versions": {"mujoco": "3.1.0"}}, "results with versions mujoco 3.1.0 .*, not 3"),
+        ({"settings": None}, "results with settings not recorded, by an earlier release .*, not"),
+    ],
+)
+def test_rows_from_elsewhere_are_not_continued(
+    run_folder: Path, tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    evaluate(config(run_folder, "--num_episodes 2", out=tmp_path))
+    path = tmp_path / "results.jsonl"
+    first, second = path.read_text().splitlines()
+    path.write_text(f"{first}\n{json.dumps({**json.loads(second), **changes})}\n")
+    before = path.read_bytes()
+    with pytest.raises(RequestError, match=message):
+        evaluate(config(run_folder, "--num_episodes 3", out=tmp_path))
+    assert path.read_bytes() == before
 
 
 def test_killed_and_interrupted_it_goes_on_to_the_same_file(

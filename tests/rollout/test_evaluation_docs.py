@@ -63,7 +63,7 @@ def test_every_option_is_there() -> None:
     named = set(re.findall(r"`--(\w+)`", " ".join(row[0] for row in rows("Options"))))
     kinds = (PolicyOptions, ObservationSpec, Corruption)
     options = {item.name for kind in kinds for item in fields(kind)}
-    options -= {"corruption", "stats_sha256", "seed"}
+    options -= {"corruption", "stats_sha256", "seed", "render_size"}
     assert options | {"no_corruption", "corruption_seed"} <= named
 
 

@@ -74,7 +74,8 @@ def test_a_line_gives_the_result_back(result: EpisodeResult) -> None:
         ({"failure": "bored"}, "'failure' is \"bored\""),
         ({"versions": {"numpy": 2}}, "'versions' is"),
         ({"observation": 3}, "'observation' is"),
-        ({"version": 3}, "'version' is 3; this release reads 1 and 2"),
+        ({"version": 4}, "'version' is 4; this release reads 1 to 3"),
+        ({"settings": 3}, "'settings' is 3"),
         ({"mood": "good"}, "'mood' is unknown"),
     ],
 )
@@ -95,8 +96,11 @@ def test_numbers_that_json_does_not_know_are_not_written() -> None:
         replace(MISS, columns={**MISS.columns, "face_force": float("nan")}).to_line()
 
 
-def test_rows_of_version_1_are_read() -> None:
+def test_rows_of_version_1_and_2_are_read() -> None:
     values = json.loads(MISS.to_line())
+    del values["settings"]
+    values["version"] = 2
+    assert EpisodeResult.from_line(json.dumps(values)) == MISS
     del values["version"], values["observation"]
     values["arm"] = values.pop("condition")
     assert EpisodeResult.from_line(json.dumps(values)) == replace(MISS, observation=None)

@@ -109,7 +109,7 @@ def test_table() -> None:
     cells = {name.strip(): value.strip() for name, value in rows.items()}
     assert cells["success"].startswith("3/5  60.0% (95 % interval 23.1% to 88.2%)")
     assert cells["success in 6 s"].startswith("2/5")
-    assert cells["completion time"] == "5.34 ± 1.16 s"
+    assert cells["completion time"] == "5.34 ± 1.16 s (mean ± sd of 3 successes)"
     assert cells["closest distance"] == "0.015 (median), 0.03 (max)"
     assert cells["failures"] == "never_grasped 1, missed_low 1"
     assert cells["written to"] == "here"

@@ -14,9 +14,10 @@ from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training import images as images_module
-from robo_manip_baselines.training.images import ImageStore, fit_image, free_memory
+from robo_manip_baselines.training.images import ImageStore, free_memory
 
 # Not the order in which files keep them.
 CAMERAS = ("top", "angle", "front_close")
@@ -64,14 +65,6 @@ def test_images_are_those_of_the_files(
         for wrong in (-1, 16):
             with pytest.raises(IndexError, match="rows 0 to 15, not"):
                 source.images(np.array([0, wrong]))
-
-
-def test_pixels_are_means_of_the_area_they_stand_for() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
-    means = image.reshape(4, 2, 3, 4, 3).mean(axis=(1, 3))
-    # Rounding, in OpenCV of halves to even.
-    assert np.abs(fit_image(image, (4, 3)).astype(float) - means).max() <= 0.5
-    assert fit_image(image, (8, 12)) is image
 
 
 @pytest.mark.parametrize("is_held", [True, False])

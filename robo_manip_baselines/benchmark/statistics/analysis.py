@@ -44,6 +44,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     TaskStudy,
 )
 from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.rollout.agreement import require_one_comparison
 from robo_manip_baselines.rollout.results import Proportion
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
@@ -173,10 +174,14 @@ def analyze(
         resamples: of each bootstrap.
 
     Raises:
-        RequestError: there are no rows, or none of the reference.
+        RequestError: there are no rows, none of the reference, or rows that do not belong together,
+            see `require_one_comparison`.
     """
     if not rows:
         raise RequestError("there are no result rows; evaluate a condition first")
+    require_one_comparison([row.result for row in rows])
+    if (env := rows[0].result.env) != task.name:
+        raise RequestError(f"results of {env} are no results of {task.name}; give its own task")
     grouped: dict[str, list[ResultRow]] = {}
     for row in rows:
         grouped.setdefault(row.result.condition, []).append(row)

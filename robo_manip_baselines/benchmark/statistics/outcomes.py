@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.rollout.agreement import require_one_condition
 from robo_manip_baselines.rollout.results import EpisodeResult, read_rows
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -128,8 +129,13 @@ class OutcomeMatrix:
 
 
 def outcome_matrix(rows: Sequence[ResultRow]) -> OutcomeMatrix:
-    """Arrange the result rows of one condition by training and evaluation seed."""
+    """Arrange the result rows of one condition by training and evaluation seed.
+
+    Raises:
+        RequestError: they are not all of one condition, or an episode is there twice.
+    """
     results = [row.result for row in rows]
+    require_one_condition(results)
     train_seeds = sorted_train_seeds(r.train_seed for r in results)
     seeds = tuple(sorted({r.seed for r in results}))
 

@@ -51,6 +51,22 @@ def backend_in_use() -> str:
     return os.environ.get("MUJOCO_GL", "").strip().lower() or "egl"
 
 
+def viewer_problem() -> str | None:
+    """Return None if MuJoCo's viewer can open a window, else why not.
+
+    The answer is found by opening the display in a subprocess.
+    """
+    is_linux = sys.platform == "linux"
+    if is_linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return "no display ($DISPLAY is not set)"
+    command = [sys.executable, "-c", "import glfw; raise SystemExit(not glfw.init())"]
+    try:
+        probe = subprocess.run(command, capture_output=True, timeout=PROBE_TIMEOUT, check=False)
+    except subprocess.TimeoutExpired:
+        return f"the display did not answer within {PROBE_TIMEOUT:.0f} s"
+    return None if probe.returncode == 0 else "no window can be opened on the display"
+
+
 def apt_line(backend: str) -> str:
     """Return the command that installs ``backend`` on Debian and Ubuntu."""
     sudo = "" if os.geteuid() == 0 else "sudo "

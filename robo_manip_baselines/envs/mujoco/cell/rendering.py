@@ -36,6 +36,9 @@ from robo_manip_baselines.runs.errors import RequestError, require_choice
 _MAX_GEOMS: Final = 2000
 """Room in the scene for geoms and their decorations; a cell has a few hundred."""
 
+MAX_MULTISAMPLES: Final = 64
+"""Most samples per pixel that are accepted; drivers offer 4 to 32, and use what they have."""
+
 _open_renderers: weakref.WeakSet[CameraRenderer] = weakref.WeakSet()
 
 
@@ -67,8 +70,10 @@ class CameraRenderer:
     ) -> None:
         if height < 1 or width < 1:
             raise RequestError(f"image size {height}x{width} is not valid; both must be positive")
-        if multisamples < 0:
-            raise RequestError(f"multisamples {multisamples} is not valid; 0 (off) or more")
+        if not 0 <= multisamples <= MAX_MULTISAMPLES:
+            raise RequestError(
+                f"multisamples {multisamples} is not valid; 0 (off) to {MAX_MULTISAMPLES}"
+            )
         self.model = model
         self.height, self.width = height, width
         self.shadows, self.multisamples = shadows, multisamples
@@ -102,6 +107,10 @@ class CameraRenderer:
         if self._target is not None:
             self._target.free()
             self._target = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: it makes an OpenGL context of its own when it first draws."""
+        return {**self.__dict__, "_target": None}
 
     def __enter__(self) -> CameraRenderer:
         return self

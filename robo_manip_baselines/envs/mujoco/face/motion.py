@@ -158,15 +158,29 @@ class MotionLibrary:
         )
 
     @cached_property
-    def sha256(self) -> str:
-        """SHA-256 of the motion, whatever file it came from; 64 hexadecimal digits."""
+    def motion_sha256(self) -> str:
+        """SHA-256 of the recorded motion, without predictions; 64 hexadecimal digits."""
         digest = hashlib.sha256()
-        for name in ("mouth", "orientation", "jaw", "run_start", "run_length", "predicted"):
-            if (array := getattr(self, name)) is not None:
-                add_array(digest, name, array)
+        for name in ("mouth", "orientation", "jaw", "run_start", "run_length"):
+            add_array(digest, name, getattr(self, name))
         names = {"fps": self.fps, "clips": self.run_clip, "subjects": self.run_subject}
         digest.update(json.dumps(names).encode())
         return digest.hexdigest()
+
+    @cached_property
+    def prediction_sha256(self) -> str | None:
+        """SHA-256 of the predictions; None in a library without."""
+        if self.predicted is None:
+            return None
+        digest = hashlib.sha256()
+        add_array(digest, PREDICTION, self.predicted)
+        return digest.hexdigest()
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of motion and predictions, whatever file they came from."""
+        parts = f"{self.motion_sha256} {self.prediction_sha256}"
+        return hashlib.sha256(parts.encode()).hexdigest()
 
     def require(self, sha256: str | None) -> None:
         """Require that this is the library of a digest, if one is given.

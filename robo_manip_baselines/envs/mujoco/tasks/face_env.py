@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import gymnasium
@@ -11,7 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
+from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
+from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, CameraRenderer
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
@@ -28,8 +31,9 @@ from robo_manip_baselines.observation import (
     ObservedNames,
     State,
 )
-from robo_manip_baselines.observation.corruption import NO_PREDICTION
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.observation.corruption import MAX_SEED, NO_PREDICTION
+from robo_manip_baselines.observation.images import fit_image
+from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 
 Floats = NDArray[np.float64]
 
@@ -57,6 +61,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
     Args:
         obs, horizon, cameras, image_size, object_pose, arms: see `ObservationSpec`.
+        render_size: height and width at which cameras are drawn, before `fit_image` makes the
+            images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
         face_motion: start of the recorded motion: ``episode`` or ``after_lift``.
         clips: ids of recorded clips to draw from; all if None.
@@ -64,6 +70,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         motion_sha256: digest of the library's motion (`MotionLibrary.sha256`); any if None.
         shadows, multisamples: prettier and slower images, for videos.
         render_mode: ``rgb_array`` or ``human`` (MuJoCo's viewer).
+
+    Copies (``copy.deepcopy``, ``pickle``) go on from the same state, and draw with an OpenGL
+    context of their own.
 
     Attributes:
         task: entry of the task.
@@ -88,32 +97,42 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         *,
         obs: str = "baseline",
         horizon: int = 2,
-        cameras: Sequence[str] = CAMERAS,
+        cameras: str | Sequence[str] = CAMERAS,
         image_size: tuple[int, int] = (480, 640),
+        render_size: tuple[int, int] | None = None,
         object_pose: bool = False,
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
         face_motion: str = "episode",
-        clips: Sequence[str] | None = None,
-        motion_library: str | None = None,
+        clips: str | Sequence[str] | None = None,
+        motion_library: str | Path | None = None,
         motion_sha256: str | None = None,
         shadows: bool = False,
         multisamples: int = 0,
         render_mode: str | None = None,
+        **unknown: Any,
     ) -> None:
-        if render_mode is not None:
-            require_choice("render mode", render_mode, self.metadata["render_modes"])
-        self.render_mode = render_mode
-        if not isinstance(corruption, Corruption):
-            corruption = Corruption.from_json(corruption or {})
-        size = (image_size[0], image_size[1])
+        for name in unknown:
+            require_choice("argument", name, _argument_names(type(self)))
+        self.render_mode = _checked_render_mode(render_mode, self.metadata["render_modes"])
         spec = self.observation_spec = ObservationSpec(
-            obs, horizon, tuple(cameras), size, object_pose, arms, corruption
+            obs=obs,
+            horizon=horizon,
+            cameras=cameras,  # type: ignore[arg-type]  # one name becomes a tuple
+            image_size=image_size,
+            render_size=render_size,
+            object_pose=object_pose,
+            arms=arms,
+            corruption=_make_corruption(corruption),
         )
+        _check_drawing(shadows, multisamples)
         if object_pose and not self.task.names.objects:
             raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")
         self.renders_images = True
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
+        self.clips = _clip_names(clips)
+        if not isinstance(motion_library, str | Path | None):
+            raise RequestError(f"motion_library {motion_library!r}: must be the path of a file")
         self._pipeline = spec.make_pipeline()
         self.library = MotionLibrary.load(motion_library)
         self.library.require(motion_sha256)
@@ -125,9 +144,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 )
             if self.library.predicted is None:
                 raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
-        for clip in clips or ():
+        for clip in self.clips or ():
             require_choice("clip", clip, set(self.library.run_clip))
-        self.clips = None if clips is None else tuple(clips)
         self.face = FaceModel.load()
         scene = build_cell()
         add_face(scene)
@@ -137,9 +155,10 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.data = mujoco.MjData(self.model)
         self.substeps = round(CONTROL_PERIOD / self.model.opt.timestep)
         self.renderer = CameraRenderer(
-            self.model, *spec.image_size, shadows=shadows, multisamples=multisamples
+            self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )
         self._viewer: Any = None
+        self._stage = "made"
         self._index_model()
         low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high)
@@ -203,7 +222,25 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Start an episode; every random choice comes from ``seed``."""
+        """Start an episode; every random choice comes from ``seed``.
+
+        Args:
+            seed: 0 to 2⁶³ - 1; None goes on with the generator of the last one.
+            options: there are none: None or empty.
+
+        Raises:
+            RequestError: the seed or an option is not valid.
+            gymnasium.error.ClosedEnvironmentError: after `close`.
+        """
+        self._require_open("reset")
+        if options:
+            given = ", ".join(map(str, options)) if isinstance(options, Mapping) else options
+            raise RequestError(
+                f"reset option {given}: unknown; an episode has no options, give arguments to "
+                "gymnasium.make instead"
+            )
+        if seed is not None:
+            seed = require_integer("seed", seed, 0, MAX_SEED)
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         self.step_count = 0
@@ -227,6 +264,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         if self._pipeline:
             # Last, so that the world is the same as without corruption.
             self._pipeline.reset(int(self.np_random.integers(2**32)) if seed is None else seed)
+        self._stage = "reset"
         self._show()
         return self.observe(), self.info()
 
@@ -237,7 +275,10 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
         Raises:
             ValueError: the action has the wrong shape or is not finite.
+            gymnasium.error.ResetNeeded: before the first `reset`.
+            gymnasium.error.ClosedEnvironmentError: after `close`.
         """
+        self._require_episode("step")
         self.simulate(action)
         reward, terminated = self.advance()
         self._show()
@@ -249,10 +290,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         Raises:
             ValueError: the action has the wrong shape or is not finite.
         """
-        action = np.asarray(action, dtype=np.float64)
-        shape = self._actuators.shape
-        if action.shape != shape or not np.isfinite(action).all():
-            raise ValueError(f"action of shape {action.shape} must be {shape} finite numbers")
+        action = self._checked_action(action)
         low, high = self.model.actuator_ctrlrange[self._actuators].T
         self.data.ctrl[self._actuators] = np.clip(action, low, high)
         for substep in range(self.substeps):
@@ -264,24 +302,65 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
+    def _checked_action(self, action: Any) -> Floats:
+        """Return an action as float64.
+
+        Raises:
+            ValueError: it has the wrong shape, or is not finite.
+        """
+        names, form = self.action_names, f"must be ({len(self._actuators)},) finite numbers"
+        try:
+            values = np.asarray(action)
+        except (TypeError, ValueError):  # rows of different lengths, say
+            values = np.asarray(None)
+        if values.dtype.kind not in "fiu":
+            raise ValueError(f"action {' '.join(repr(action).split())}: {form}")
+        values = values.astype(np.float64)
+        if values.shape != (len(names),):
+            raise ValueError(f"action of shape {values.shape}: {form}")
+        if len(bad := np.flatnonzero(~np.isfinite(values))):
+            place = f"{values[bad[0]]} in element {bad[0]}, {names[bad[0]]}"
+            raise ValueError(f"action with {place}: {form}")
+        return values
+
     def start_motion(self) -> None:
         """Let the recorded motion start now, if it has been waiting."""
         if self.motion_start is None:
             self.motion_start = self.step_count
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the view of the camera ``angle``, (H, W, 3) uint8; None in mode ``human``."""
+        """Return the view of the camera ``angle`` as drawn, (H, W, 3) uint8; None in ``human``.
+
+        H and W are those of ``render_size``.
+        """
+        self._require_episode("render")
         if self.render_mode == "human":
             self._show()
             return None
         return self.renderer.render(self.data, [RENDER_CAMERA])[RENDER_CAMERA]
 
     def close(self) -> None:
-        """Free the OpenGL context, and close the viewer."""
+        """Free the OpenGL context, and close the viewer; may be called again."""
+        self._stage = "closed"
         self.renderer.close()
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: a viewer's window stays with the original."""
+        return {**self.__dict__, "_viewer": None}
+
+    def _require_open(self, method: str) -> None:
+        if self._stage == "closed":
+            raise gymnasium.error.ClosedEnvironmentError(
+                f"{method}() after close(): make the environment again"
+            )
+
+    def _require_episode(self, method: str) -> None:
+        self._require_open(method)
+        if self._stage == "made":
+            raise gymnasium.error.ResetNeeded(f"{method}() before reset(): call reset() first")
 
     def _show(self) -> None:
         """Show the present state in MuJoCo's viewer, in mode ``human``."""
@@ -391,7 +470,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         if spec.cameras and self.renders_images:
             views = self.renderer.render(self.data, spec.cameras)
             for key, camera in spec.image_keys().items():
-                observation[key] = views[camera]
+                observation[key] = fit_image(views[camera], spec.image_size)
         return observation
 
     def episode_row(self) -> dict[str, Any]:
@@ -478,3 +557,48 @@ def make_observation_space(spec: ObservationSpec, names: ObservedNames) -> gymna
     for key in spec.image_keys():
         spaces[key] = gymnasium.spaces.Box(0, 255, (*spec.image_size, 3), np.uint8)
     return gymnasium.spaces.Dict(spaces)
+
+
+# -- arguments ------------------------------------------------------------------------------------
+
+
+def _argument_names(env: type) -> list[str]:
+    """Return the keyword arguments of an environment and of the classes that it derives from."""
+    parameters = [
+        parameter
+        for owner in env.__mro__
+        if issubclass(owner, FaceEnv)
+        for parameter in inspect.signature(owner.__init__).parameters.values()
+    ]
+    return sorted({p.name for p in parameters if p.kind is p.KEYWORD_ONLY})
+
+
+def _checked_render_mode(mode: Any, valid: Iterable[str]) -> str | None:
+    if mode is not None:
+        require_choice("render mode", mode, valid)
+    if mode == "human" and (problem := viewer_problem()):
+        raise RequestError(f"render mode 'human': {problem}; valid here: rgb_array, or None")
+    return mode
+
+
+def _make_corruption(given: Any) -> Corruption:
+    """Return a corruption given as such or as a mapping; the spec refuses anything else."""
+    if given is None:
+        return Corruption()
+    return Corruption.from_json(given) if isinstance(given, Mapping) else given
+
+
+def _check_drawing(shadows: Any, multisamples: Any) -> None:
+    if not isinstance(shadows, bool | np.bool_):
+        raise RequestError(f"shadows {shadows!r}: must be True or False")
+    require_integer("multisamples", multisamples, 0, MAX_MULTISAMPLES)
+
+
+def _clip_names(given: Any) -> tuple[str, ...] | None:
+    """Return the clips to draw from, given one name or several; None for all."""
+    if given is None:
+        return None
+    names = [given] if isinstance(given, str) else given
+    if not isinstance(names, Sequence) or not names:
+        raise RequestError(f"clips {given!r}: must be ids of clips, at least one, or None for all")
+    return tuple(names)

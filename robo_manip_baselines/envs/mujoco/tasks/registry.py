@@ -335,6 +335,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "horizon": (int,),
     "cameras": (list,),
     "image_size": (list,),
+    "render_size": (list, type(None)),
     "object_pose": (bool,),
     "arms": (str,),
     "corruption": (dict, type(None)),
@@ -371,11 +372,11 @@ def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
         if type(value) not in kinds:  # a bool is no int here
             return f"has {name} {str(value)[:80]!r}, not of type {kinds[0].__name__}"
         if isinstance(value, list):
-            kind = int if name == "image_size" else str
+            kind = int if name.endswith("_size") else str
             if not all(type(item) is kind for item in value):
                 return f"has {name} {str(value)[:80]}, not a list of type {kind.__name__}"
-    if len(kwargs.get("image_size", (0, 0))) != 2:
-        return f"has image_size {str(kwargs['image_size'])[:80]}, not height and width"
+        if name.endswith("_size") and value is not None and len(value) != 2:
+            return f"has {name} {str(value)[:80]}, not height and width"
     if kwargs.get("render_mode") not in (None, "rgb_array"):
         return "has a render_mode that opens windows"
     return ""

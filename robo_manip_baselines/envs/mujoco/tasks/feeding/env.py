@@ -116,8 +116,10 @@ class FeedingEnv(FaceEnv):
     |---|---|---|
     | ``obs`` | ``"baseline"`` | preset: baseline, current, current_pred |
     | ``horizon`` | 2 | frames that current_pred looks ahead, 1 to 5 |
-    | ``cameras`` | all three | any of top, angle, front_close; ``()`` for none |
+    | ``cameras`` | all three | any of top, angle, front_close, or one name; ``()`` for none |
     | ``image_size`` | (480, 640) | height and width |
+    | ``render_size`` | None | height and width at which cameras are drawn, before the images are
+    cropped about their centre and shrunk to ``image_size``; the same if None |
     | ``object_pose`` | False | show the cube's position |
     | ``corruption`` | None | what stands between true and shown mouth: an
     ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
@@ -132,7 +134,8 @@ class FeedingEnv(FaceEnv):
     | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;
     ``"human"``: MuJoCo's viewer |
 
-    Raises ``RequestError``, a ``ValueError``, when an argument is not valid.
+    Raises ``RequestError``, a ``ValueError``, when an argument, a seed (0 to 2⁶³ - 1) or an option
+    of ``reset`` (there are none) is not valid.
 
     ## Version history
 
