@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import json
 import logging
-import signal
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +32,7 @@ from robo_manip_baselines.rollout.results import completion_time, require_seeds
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, write_json
 from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_image
+from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
 from robo_manip_baselines.runs.versions import software_versions
 
 SUMMARY = "summary.json"
@@ -199,9 +196,10 @@ def collect(collection: Collection) -> CollectionSummary:
             logger.info("%d of %d episodes are there already", total - len(todo), total)
         steps, begin = 0, time.perf_counter()
         with tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress:
-            for count in _record_all(collection, env, todo):
-                steps += count
-                progress.update()
+            with contextlib.closing(_record_all(collection, env, todo)) as counts:
+                for count in counts:
+                    steps += count
+                    progress.update()
         elapsed = time.perf_counter() - begin
     summary = _summarize(collection, steps, steps / elapsed if todo else None)
     content = {
@@ -240,14 +238,34 @@ def _record_all(
         for seed in seeds:
             yield _record(collection, env, seed)
         return
-    # Spawned, not forked: an OpenGL context does not survive a fork.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (collection,))
+    waiting, is_done = deque(seeds), False
+    pool: list[Worker] = []
     try:
-        futures = [pool.submit(_record_in_worker, seed) for seed in seeds]
-        for future in as_completed(futures):
-            yield future.result()
+        for _ in range(workers):
+            pool.append(Worker(_Recorder, collection))
+            pool[-1].submit(waiting.popleft())
+        busy = list(pool)
+        while busy:
+            for worker in wait_for(busy):
+                yield _receive(worker)
+                if waiting:
+                    worker.submit(waiting.popleft())
+                else:
+                    busy.remove(worker)
+        is_done = True
     finally:
-        pool.shutdown(cancel_futures=True)
+        close_workers(pool, at_once=not is_done)
+        remove_partial_episodes(collection.out)
+
+
+def _receive(worker: Worker) -> int:
+    try:
+        return worker.receive()
+    except WorkerDiedError as error:
+        raise RuntimeError(
+            f"a worker process died ({error}); if it was killed for lack of memory, take fewer "
+            "--workers; the same command records what is missing"
+        ) from error
 
 
 def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> int:
@@ -259,20 +277,16 @@ def _record(collection: Collection, env: gymnasium.Env[Any, Any], seed: int) -> 
     return len(demonstration.arrays["time"])
 
 
-_worker: dict[str, Any] = {}
-"""State of a worker process between episodes; empty in every other process."""
+class _Recorder:
+    """Environment of a worker process: seeds in, numbers of recorded steps out."""
 
+    def __init__(self, collection: Collection) -> None:
+        self._collection = collection
+        self._env = make_env(collection.env, **collection.env_kwargs)
+        self.close = self._env.close
 
-def _start_worker(collection: Collection) -> None:
-    # Ctrl-C reaches the whole process group: workers stop at once, the parent does the talking.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    env = make_env(collection.env, **collection.env_kwargs)
-    atexit.register(env.close)
-    _worker.update(collection=collection, env=env)
-
-
-def _record_in_worker(seed: int) -> int:
-    return _record(_worker["collection"], _worker["env"], seed)
+    def __call__(self, seed: int) -> int:
+        return _record(self._collection, self._env, seed)
 
 
 def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:
