@@ -7,7 +7,7 @@ import json
 import logging
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -231,7 +231,7 @@ def _summarize(
 
 def _record_all(
     collection: Collection, env: gymnasium.Env[Any, Any], seeds: list[int]
-) -> Iterator[int]:
+) -> Generator[int, None, None]:
     """Record seeds, here or in worker processes; yield the steps of each as it is finished."""
     workers = min(collection.workers, len(seeds))
     if workers <= 1:

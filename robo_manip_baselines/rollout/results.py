@@ -12,10 +12,10 @@ import types
 import typing
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
@@ -203,14 +203,12 @@ class ResultsFile:
         done: results that the folder holds, by seed.
     """
 
-    def __init__(self, file: TextIO, done: dict[int, EpisodeResult]) -> None:
+    def __init__(self, file: AppendFile, done: dict[int, EpisodeResult]) -> None:
         self._file, self.done = file, done
 
     def append(self, result: EpisodeResult) -> None:
         """Write a row; it is on the disk when this returns."""
-        self._file.write(result.to_line() + "\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        self._file.append(f"{result.to_line()}\n".encode())
         self.done[result.seed] = result
 
     def of(self, seeds: Sequence[int]) -> list[EpisodeResult]:
@@ -241,7 +239,7 @@ def open_results(
         write_json(folder / MANIFEST, content)
     if path.exists():  # drop a torn row
         os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
-    with path.open("a", encoding="utf-8") as file:
+    with closing(AppendFile(path, is_flushed=True)) as file:
         yield ResultsFile(file, done)
     write_text(path, "".join(f"{done[seed].to_line()}\n" for seed in sorted(done)))
 

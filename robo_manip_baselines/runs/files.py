@@ -127,31 +127,33 @@ def atomic_hdf5(path: str | Path, libver: tuple[str, str]) -> Iterator[h5py.File
         temporary.write_bytes(content)
 
 
-class LineFile:
-    """Text file that grows by whole lines, each on the disk when `append` returns.
+class AppendFile:
+    """File that grows by whole records.
 
     Args:
         path: made if it does not exist.
+        is_flushed: whether a record has reached the disk when `append` returns.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, *, is_flushed: bool = False) -> None:
+        self._path, self._is_flushed = path, is_flushed
         with disk_errors(path):
             self._file = path.open("ab", buffering=0)
 
-    def append(self, line: str) -> None:
-        """Append a line, given without its end.
+    def append(self, record: bytes) -> None:
+        """Append a record.
 
         Raises:
             WriteError: the disk is full, or fails; the file is as it was.
         """
-        rest = memoryview((line + "\n").encode("utf-8", "surrogateescape"))
+        rest = memoryview(record)
         size = os.fstat(self._file.fileno()).st_size
         with disk_errors(self._path):
             try:
                 while rest:
                     rest = rest[self._file.write(rest) :]
-                os.fsync(self._file.fileno())
+                if self._is_flushed:
+                    os.fsync(self._file.fileno())
             except OSError:
                 with suppress(OSError):
                     os.ftruncate(self._file.fileno(), size)
@@ -205,8 +207,8 @@ def prepare_folder(folder: str | Path) -> Path:
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder for this process; a killed process holds nothing.
 
-    It has the file ``.lock`` meanwhile. A folder that does not exist is made, and removed again if
-    it is empty at the end, so that a request that is refused leaves nothing.
+    It has the file ``.lock`` from then on. After a request that is refused, the file is removed if
+    it is new, and so is the folder.
 
     Args:
         folder: to be written.
@@ -216,9 +218,15 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
         RequestError: another process holds it, or it cannot be written to.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
+    is_new = not (folder / LOCK).exists()
     try:
-        with _lock(folder / LOCK, folder, wait):
-            yield
+        with _lock(folder / LOCK, folder, wait) as lock:
+            try:
+                yield
+            except (RequestError, WriteError):
+                if is_new:
+                    lock.unlink(missing_ok=True)
+                raise
     finally:
         with suppress(OSError):  # the first that is not empty
             for path in made:
@@ -227,17 +235,21 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 @contextmanager
 def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold one file that is to be written, as `locked` does a folder, by ``.NAME.lock``.
+    """Hold one file that is to be written, as `locked` does a folder; nothing is left beside it.
 
     Raises:
         RequestError: another process holds it, or its folder cannot be written to.
     """
-    with _lock(path.with_name(f".{path.name}{LOCK}"), path, wait):
-        yield
+    with _lock(path.with_name(f".{path.name}{LOCK}"), path, wait) as lock:
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 @contextmanager
-def _lock(lock: Path, what: Path, wait: bool) -> Iterator[None]:
+def _lock(lock: Path, what: Path, wait: bool) -> Iterator[Path]:
+    """Yield the file by which ``what`` is held; it may be removed while it is."""
     while True:
         prepare_folder(lock.parent)
         try:
@@ -248,7 +260,7 @@ def _lock(lock: Path, what: Path, wait: bool) -> Iterator[None]:
             raise _not_writable(lock.parent, error) from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            # The process that held it has removed the file before it let go of it.
+            # The process that held it may have removed the file before it let go of it.
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(descriptor), lock.stat()):
                     break
@@ -263,10 +275,8 @@ def _lock(lock: Path, what: Path, wait: bool) -> Iterator[None]:
             raise
         os.close(descriptor)
     try:
-        yield
+        yield lock
     finally:
-        with suppress(OSError):
-            lock.unlink()
         os.close(descriptor)
 
 

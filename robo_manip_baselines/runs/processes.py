@@ -44,10 +44,10 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         arguments = (theirs, make_handler, args)
-        self._process: Any = context.Process(target=_work, args=arguments, daemon=True)
+        self.process: Any = context.Process(target=_work, args=arguments, daemon=True)
         try:
             with _signals_blocked():
-                self._process.start()
+                self.process.start()
         finally:
             theirs.close()  # so that the pipe ends when the worker does
 
@@ -67,8 +67,8 @@ class Worker:
         try:
             answer, error = self.pipe.recv()
         except (EOFError, OSError) as ended:
-            self._process.join(_PATIENCE)
-            raise WorkerDiedError(f"exit code {self._process.exitcode}") from ended
+            self.process.join(_PATIENCE)
+            raise WorkerDiedError(f"exit code {self.process.exitcode}") from ended
         if error is not None:
             raise error
         return answer
@@ -76,15 +76,15 @@ class Worker:
     def close(self, *, at_once: bool = False) -> None:
         """End the process, after the request at hand or at once; may be called again."""
         self.pipe.close()  # a worker ends when it finds that its pipe has
-        if self._process is not None and self._process.pid is not None:
+        if self.process is not None and self.process.pid is not None:
             if at_once:
-                self._process.kill()
-            self._process.join(_PATIENCE)
-            if self._process.is_alive():
-                self._process.kill()
-                self._process.join()
-            self._process.close()
-        self._process = None
+                self.process.kill()
+            self.process.join(_PATIENCE)
+            if self.process.is_alive():
+                self.process.kill()
+                self.process.join()
+            self.process.close()
+        self.process = None
 
 
 def close_workers(workers: Sequence[Worker], *, at_once: bool = False) -> None:
