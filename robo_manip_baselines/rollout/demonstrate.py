@@ -21,16 +21,22 @@ from robo_manip_baselines.data import (
     EpisodeReader,
     episode_path,
     finished_seeds,
+    list_episodes,
     read_metadata,
     remove_partial_episodes,
     write_episode,
 )
+from robo_manip_baselines.data.files import FAILED_FOLDER, list_failures
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id, make_env, task_entry
 from robo_manip_baselines.policy.presets import require_at_least
-from robo_manip_baselines.rollout.results import completion_time, require_seeds
+from robo_manip_baselines.rollout.results import (
+    completion_time,
+    require_own_summary,
+    require_seeds,
+)
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import prepare_folder, write_json
+from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder, write_json
 from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_image
 from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
 from robo_manip_baselines.runs.versions import software_versions
@@ -184,23 +190,32 @@ def collect(collection: Collection) -> CollectionSummary:
         RequestError: the request cannot be met; nothing has been written then.
     """
     # Everything about the request that can be wrong is found out here, before any file exists.
+    require_out_folder(collection.out, _DEMONSTRATIONS)
+    require_own_summary(collection.out / SUMMARY, "expert", "first_seed")
     with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
         _require_fitting_expert(collection, env)
         _refuse_other_settings(collection, world_of(env).xml_hash)
-        prepare_folder(collection.out)
-        remove_partial_episodes(collection.out)
-        done = finished_seeds(collection.out)
-        todo = [seed for seed in collection.seeds if seed not in done]
-        if len(todo) < len(collection.seeds):
-            total = len(collection.seeds)
-            logger.info("%d of %d episodes are there already", total - len(todo), total)
-        steps, begin = 0, time.perf_counter()
-        with tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress:
-            with contextlib.closing(_record_all(collection, env, todo)) as counts:
-                for count in counts:
-                    steps += count
-                    progress.update()
-        elapsed = time.perf_counter() - begin
+        with locked(collection.out):
+            return _collect(collection, env)
+
+
+def _collect(collection: Collection, env: gymnasium.Env[Any, Any]) -> CollectionSummary:
+    """Record what is missing in the folder of a collection, which is held."""
+    remove_partial_episodes(collection.out)
+    done = finished_seeds(collection.out)
+    todo = [seed for seed in collection.seeds if seed not in done]
+    if len(todo) < len(collection.seeds):
+        total = len(collection.seeds)
+        logger.info("%d of %d episodes are there already", total - len(todo), total)
+    steps, begin = 0, time.perf_counter()
+    with (
+        tqdm(total=len(todo), unit="episode", desc=collection.expert) as progress,
+        contextlib.closing(_record_all(collection, env, todo)) as counts,
+    ):
+        for count in counts:
+            steps += count
+            progress.update()
+    elapsed = time.perf_counter() - begin
     summary = _summarize(collection, steps, steps / elapsed if todo else None)
     content = {
         "env": task_entry(collection.env).env_id,
@@ -287,6 +302,21 @@ class _Recorder:
 
     def __call__(self, seed: int) -> int:
         return _record(self._collection, self._env, seed)
+
+
+def _holds_an_episode(folder: Path) -> bool:
+    for path in [*list_episodes(folder), *list_failures(folder)]:
+        with contextlib.suppress(RequestError):  # damaged, or made by something else
+            read_metadata(path)
+            return True
+    return False
+
+
+_DEMONSTRATIONS = FolderKind(
+    "a folder of demonstrations",
+    _holds_an_episode,
+    begun=lambda path: path.name == FAILED_FOLDER and path.is_dir(),
+)
 
 
 def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:

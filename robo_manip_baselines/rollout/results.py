@@ -21,7 +21,17 @@ import numpy as np
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import prepare_folder, read_json, write_json, write_text
+from robo_manip_baselines.runs.files import (
+    AppendFile,
+    FileKind,
+    FolderKind,
+    prepare_folder,
+    read_json,
+    require_out_file,
+    require_out_folder,
+    write_json,
+    write_text,
+)
 from robo_manip_baselines.runs.progress import closing_table
 
 ROW_VERSION = 2
@@ -33,6 +43,8 @@ SCHEMA_VERSION = 1
 RESULTS = "results.jsonl"
 MANIFEST = "evaluation.json"
 SUMMARY = "summary.json"
+
+_EVALUATION = FolderKind("an evaluation of bin/Rollout.py", lambda path: (path / MANIFEST).exists())
 
 CONFIDENCE = 0.95
 """of all intervals."""
@@ -214,6 +226,31 @@ class ResultsFile:
     def of(self, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Return the results of these seeds, as far as they are there."""
         return [self.done[seed] for seed in seeds if seed in self.done]
+
+
+def require_evaluation_folder(folder: Path, settings: dict[str, Any]) -> None:
+    """Make sure that results of these settings can be written to a folder.
+
+    Raises:
+        RequestError: the folder holds something else, results of other settings, or is damaged.
+    """
+    require_out_folder(folder, _EVALUATION)
+    _refuse_other_settings(folder, settings)
+    require_own_summary(folder / SUMMARY, "condition", "success")
+
+
+def require_own_summary(path: Path, *names: str) -> None:
+    """Make sure that a summary, if there is one, has these names, and so may be replaced.
+
+    Raises:
+        RequestError: it lacks some.
+    """
+
+    def read(path: Path) -> None:
+        if missing := [name for name in names if name not in read_json(path)]:
+            raise RequestError(f"'{path}' has no '{missing[0]}': another program made it")
+
+    require_out_file(path, FileKind("a summary", read))
 
 
 @contextmanager

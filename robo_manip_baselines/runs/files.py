@@ -1,7 +1,7 @@
 """Files and folders that are either complete or absent, what may be replaced, and locks.
 
 Strings hold bytes of paths that are no UTF-8 as Python does (``surrogateescape``): text files keep
-the bytes, JSON has them as ``\\udc80`` to ``\\udcff``.
+the bytes, JSON has them as escapes.
 """
 
 from __future__ import annotations
@@ -408,7 +408,7 @@ def require_out_file(
         raise RequestError(f"{option} {out}: is a device or a pipe; name a file")
     for given in inputs:
         if given is not None and given.exists():
-            if mode is not None and os.path.samefile(out, given):
+            if mode is not None and out.samefile(given):
                 raise RequestError(f"{option} {out}: is an input; name another file")
             if given.is_dir() and out.resolve().is_relative_to(given.resolve()):
                 raise RequestError(
@@ -448,7 +448,7 @@ def require_out_folder(
     if mode is not None and not stat.S_ISDIR(mode):
         raise RequestError(f"{option} {out}: is a file; name a folder")
     if mode is not None:
-        if any(given and given.exists() and os.path.samefile(out, given) for given in inputs):
+        if any(given and given.exists() and out.samefile(given) for given in inputs):
             raise RequestError(f"{option} {out}: is an input; name another folder")
         if kind and not kind.is_own(out):
             ours = (LOCK, ".partial")

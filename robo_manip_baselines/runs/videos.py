@@ -1,4 +1,4 @@
-"""Recognition of the videos that commands of this project have written, which alone they replace."""
+"""Recognition of videos that commands of this project have written: no others are replaced."""
 
 from __future__ import annotations
 
