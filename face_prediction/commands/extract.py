@@ -12,10 +12,16 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.tracking.detector import FaceDetector, find_model
 from face_prediction.tracking.extract import ExtractSettings, extract_track, is_track_up_to_date
-from face_prediction.tracking.tracks import save_track
+from face_prediction.tracking.tracks import FaceTrack, save_track
 from face_prediction.tracking.video import require_video
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import file_digest, require_out_folder
+from robo_manip_baselines.runs.files import (
+    FileKind,
+    file_digest,
+    locked_file,
+    require_out_file,
+    require_out_folder,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -54,28 +60,22 @@ def run_extract(options: ExtractOptions) -> int:
     Raises:
         RequestError: nothing could be started.
     """
-    settings = options.settings
     outputs = output_paths(options.videos, options.out)
     model = find_model(options.model)
     made = kept = refused = 0
     for number, (video, out) in enumerate(outputs, start=1):
         prefix = f"[{number}/{len(outputs)}] "
         try:
-            require_video(video)
-            # a detector for each video: in video mode its clock may not run backwards
-            with FaceDetector(model, settings.detector) as detector, logging_redirect_tqdm():
-                if is_track_up_to_date(out, file_digest(video), settings, detector.description()):
-                    kept += 1
-                    logger.info("%s%s: up to date", prefix, out)
-                    continue
-                label = prefix + video.name if options.progress else None
-                track = extract_track(video, detector, settings, label)
-            save_track(out, track)
+            track = extract_one(video, out, model, options, prefix)
         except RequestError as error:
             if len(outputs) == 1:
                 raise
             refused += 1
             logger.error("%s%s", prefix, error)
+            continue
+        if track is None:
+            kept += 1
+            logger.info("%s%s: up to date", prefix, out)
             continue
         made += 1
         share = 100 * float(track.valid.mean())
@@ -83,6 +83,31 @@ def run_extract(options: ExtractOptions) -> int:
     if len(outputs) > 1:
         logger.info("%d made, %d already up to date, %d refused", made, kept, refused)
     return 2 if refused else 0
+
+
+def extract_one(
+    video: Path, out: Path, model: Path, options: ExtractOptions, prefix: str
+) -> FaceTrack | None:
+    """Write the track of one video and return it; None: it is there already.
+
+    Raises:
+        RequestError: the video cannot be used, or something else is at ``out``.
+    """
+    settings = options.settings
+    require_video(video)
+    require_out_file(out, FileKind("a face track", Path.stat), [video, model])
+    with (
+        locked_file(out, wait=True),
+        # a detector for each video: in video mode its clock may not run backwards
+        FaceDetector(model, settings.detector) as detector,
+        logging_redirect_tqdm(),
+    ):
+        if is_track_up_to_date(out, file_digest(video), settings, detector.description()):
+            return None
+        label = prefix + video.name if options.progress else None
+        track = extract_track(video, detector, settings, label)
+        save_track(out, track)
+        return track
 
 
 def output_paths(videos: Iterable[Path], out: Path) -> list[tuple[Path, Path]]:

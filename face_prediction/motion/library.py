@@ -27,7 +27,7 @@ from face_prediction.motion.motion import (
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES, continuous_quaternions
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import require_out_file
+from robo_manip_baselines.runs.files import FileKind
 from robo_manip_baselines.runs.npz import read_npz, require_array, require_json, write_npz
 
 SCHEMA = "recorded_face_motion"
@@ -194,9 +194,7 @@ def attributed_tracks(tracks: Iterable[Path], table: Path | None) -> list[tuple[
     return [(path, rows[path.stem]) for path in paths]
 
 
-def refuse_other_files(out: Path) -> None:
-    """Raise RequestError if ``out`` is a folder, or a file of another kind."""
-    require_out_file(out, lambda path: read_npz(path, SCHEMA, VERSION))
+MOTION_LIBRARY = FileKind("a motion library", lambda path: read_npz(path, SCHEMA, VERSION))
 
 
 @dataclass(frozen=True)

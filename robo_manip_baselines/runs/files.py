@@ -217,20 +217,14 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     Raises:
         RequestError: another process holds it, or it cannot be written to.
     """
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
     is_new = not (folder / LOCK).exists()
-    try:
-        with _lock(folder / LOCK, folder, wait) as lock:
-            try:
-                yield
-            except (RequestError, WriteError):
-                if is_new:
-                    lock.unlink(missing_ok=True)
-                raise
-    finally:
-        with suppress(OSError):  # the first that is not empty
-            for path in made:
-                path.rmdir()
+    with _lock(folder / LOCK, folder, wait) as lock:
+        try:
+            yield
+        except (RequestError, WriteError):
+            if is_new:
+                lock.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
@@ -249,7 +243,11 @@ def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
 
 @contextmanager
 def _lock(lock: Path, what: Path, wait: bool) -> Iterator[Path]:
-    """Yield the file by which ``what`` is held; it may be removed while it is."""
+    """Yield the file by which ``what`` is held; it may be removed while it is.
+
+    Folders that are made for it are removed again if they are empty at the end.
+    """
+    made = [path for path in lock.parents if not path.exists()]
     while True:
         prepare_folder(lock.parent)
         try:
@@ -267,8 +265,8 @@ def _lock(lock: Path, what: Path, wait: bool) -> Iterator[Path]:
         except BlockingIOError as error:
             os.close(descriptor)
             raise RequestError(
-                f"'{what}' is being written by another process; wait for its end, or choose "
-                "another --out"
+                f"'{what}' is being written by another process; choose another --out, or wait for "
+                "its end"
             ) from error
         except BaseException:
             os.close(descriptor)
@@ -278,6 +276,9 @@ def _lock(lock: Path, what: Path, wait: bool) -> Iterator[Path]:
         yield lock
     finally:
         os.close(descriptor)
+        with suppress(OSError):  # the first that is not empty
+            for path in made:
+                path.rmdir()
 
 
 def write_text(path: Path, text: str) -> None:
@@ -395,7 +396,8 @@ def require_out_file(
     Args:
         out: the file; it may exist if it is of ``kind``.
         kind: of file that the command makes.
-        inputs: files and folders that the command reads; nothing is written over or into them.
+        inputs: files and folders that the command reads, and other files that it writes; nothing
+            is written over or into them.
         option: name of the option, for messages.
 
     Raises:
@@ -406,14 +408,14 @@ def require_out_file(
         raise RequestError(f"{option} {out}: is a folder; name a file")
     if mode is not None and not stat.S_ISREG(mode):
         raise RequestError(f"{option} {out}: is a device or a pipe; name a file")
-    for given in inputs:
-        if given is not None and given.exists():
-            if mode is not None and out.samefile(given):
-                raise RequestError(f"{option} {out}: is an input; name another file")
-            if given.is_dir() and out.resolve().is_relative_to(given.resolve()):
-                raise RequestError(
-                    f"{option} {out}: is in '{given}', which is read; name a file elsewhere"
-                )
+    for given in filter(None, inputs):
+        is_same = mode is not None and given.exists() and out.samefile(given)
+        if is_same or out.resolve() == given.resolve():
+            raise RequestError(f"{option} {out}: is '{given}', another file of this command")
+        if given.is_dir() and out.resolve().is_relative_to(given.resolve()):
+            raise RequestError(
+                f"{option} {out}: is in '{given}', which is read; name a file elsewhere"
+            )
     if kind.suffix and out.suffix.lower() != kind.suffix:
         raise RequestError(f"{option} {out}: {kind.name} is written; name a file *{kind.suffix}")
     if mode is not None:
@@ -448,8 +450,8 @@ def require_out_folder(
     if mode is not None and not stat.S_ISDIR(mode):
         raise RequestError(f"{option} {out}: is a file; name a folder")
     if mode is not None:
-        if any(given and given.exists() and out.samefile(given) for given in inputs):
-            raise RequestError(f"{option} {out}: is an input; name another folder")
+        if any(given.exists() and out.samefile(given) for given in filter(None, inputs)):
+            raise RequestError(f"{option} {out}: is read; name another folder")
         if kind and not kind.is_own(out):
             ours = (LOCK, ".partial")
             try:
