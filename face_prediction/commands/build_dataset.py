@@ -20,7 +20,6 @@ from face_prediction.dataset.build import (
 from face_prediction.dataset.manifest import (
     CLIP_FOLDER,
     MANIFEST_NAME,
-    TABLE_NAME,
     ClipEntry,
     Manifest,
     assign_folds,
@@ -168,7 +167,7 @@ def _is_begun(path: Path) -> bool:
     return (
         path.name == CLIP_FOLDER
         and path.is_dir()
-        and not set(path.iterdir()) - set([*path.glob("*.h5"), *path.glob(".*.partial")])
+        and not set(path.iterdir()) - {*path.glob("*.h5"), *path.glob(".*.partial")}
     )
 
 

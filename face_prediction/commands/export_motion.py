@@ -54,9 +54,10 @@ def run_export_motion(options: ExportMotionOptions) -> None:
         RequestError: a track or the table cannot be used, or no run is left.
     """
     inputs = [*options.tracks, options.attribution]
-    require_out_file(options.out, MOTION_LIBRARY, [*inputs, options.report])
     if options.report is not None:
-        require_report(options.report, inputs, [path.stem for path in track_files(options.tracks)])
+        clips = [path.stem for path in track_files(options.tracks)]
+        require_report(options.report, [*inputs, options.out], clips)
+    require_out_file(options.out, MOTION_LIBRARY, inputs)
     clips, withheld = lift_clips(options.tracks, options.attribution, options.settings)
     library = record_motion(clips, options.settings, withheld)
     save_motion(options.out, library)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -114,8 +114,9 @@ def check_live_options(options: LiveOptions) -> None:
         require_video(video)
     if out is None:
         return
-    if video is not None and out.exists() and out.samefile(video):
-        raise RequestError(f"--out {out}: is the video itself; name another file")
+    with suppress(OSError):  # there is no such file
+        if video is not None and out.samefile(video):
+            raise RequestError(f"--out {out}: is the video itself; name another file")
     require_out_file(out, VIDEO, [options.detector_model])
 
 

@@ -233,7 +233,10 @@ def _is_run(folder: Path) -> bool:
 
 
 def _is_begun(path: Path) -> bool:
-    return path.name == METRICS_FILE and len(read_metrics(path)) == path.read_bytes().count(b"\n")
+    lines = read_metrics(path) if path.name == METRICS_FILE else [{}]
+    return all(isinstance(line, dict) and {"kind", "step"} <= line.keys() for line in lines) and (
+        len(lines) == path.read_bytes().count(b"\n")
+    )
 
 
 _RUN = FolderKind("a run of face-prediction train", _is_run, begun=_is_begun)

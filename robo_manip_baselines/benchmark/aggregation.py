@@ -33,6 +33,7 @@ from robo_manip_baselines.benchmark.work_item import (
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.rollout.results import RESULTS, read_results
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
     FolderKind,
     locked_file,
@@ -45,6 +46,9 @@ from robo_manip_baselines.runs.progress import closing_table
 REPORT = "report.html"
 VERSIONS = "versions.json"
 CONFIGS = "configs.json"
+EARLIER_ITEMS = "units"
+"""Folder of the work items of earlier releases."""
+
 TABLES = "tables"
 FIGURES = "figures"
 
@@ -157,6 +161,11 @@ def _remove_earlier(out: Path, written: Sequence[Path]) -> None:
 
 
 def _is_benchmark(folder: Path) -> bool:
+    if (folder / EARLIER_ITEMS).exists():
+        raise RequestError(
+            f"'{folder}' holds a benchmark of an earlier release, which this one cannot continue; "
+            "choose another --out"
+        )
     items = folder / ITEMS
     return items.is_dir() and all(path.name in KINDS for path in items.iterdir())
 

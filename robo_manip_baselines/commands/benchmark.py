@@ -54,9 +54,6 @@ EXAMPLE = "python bin/Benchmark.py feeding --preset smoke"
 
 EXECUTORS = ("local", "ray")
 
-EARLIER_ITEMS = "units"
-"""Folder of the work items of earlier releases."""
-
 logger = logging.getLogger(__name__)
 
 
@@ -182,17 +179,11 @@ def benchmark(options: BenchmarkOptions) -> int:
         RequestError: the request cannot be met.
     """
     inputs = [options.conditions_file, options.motion_library, options.error_stats]
-    if not (options.folder / EARLIER_ITEMS).exists():
-        require_out_folder(options.folder, BENCHMARK, inputs)
+    require_out_folder(options.folder, BENCHMARK, inputs)
     plan = plan_of(options)
     if options.reference:
         names = [condition.name for condition in plan.conditions]
         require_choice("reference condition", options.reference, names)
-    if (options.folder / EARLIER_ITEMS).exists():
-        raise RequestError(
-            f"'{options.folder}' holds a benchmark of an earlier release, which this one cannot "
-            "continue; choose another --out"
-        )
     store = ArtifactStore(options.folder / ITEMS)
     items = plan.items(options.part)
     manifests = [manifest for manifest in map(store.manifest, items) if manifest]

@@ -216,7 +216,7 @@ def record(options: RolloutOptions) -> None:
         RequestError: the request cannot be met.
     """
     from robo_manip_baselines.data import list_episodes
-    from robo_manip_baselines.rollout.demonstrate import collect
+    from robo_manip_baselines.rollout.demonstrate import collect, require_demonstrations_folder
     from robo_manip_baselines.rollout.results import mean_and_sd
     from robo_manip_baselines.rollout.videos import write_preview
 
@@ -226,6 +226,7 @@ def record(options: RolloutOptions) -> None:
     if shown and not options.spec.cameras and (problem := opengl_problem()):
         logger.warning("no preview video: %s", problem)
         shown = 0
+    require_demonstrations_folder(collection.out)
     if shown:
         require_out_file(collection.out / PREVIEW, VIDEO, option="--preview")
     summary = collect(collection)

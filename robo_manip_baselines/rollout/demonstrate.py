@@ -190,8 +190,7 @@ def collect(collection: Collection) -> CollectionSummary:
         RequestError: the request cannot be met; nothing has been written then.
     """
     # Everything about the request that can be wrong is found out here, before any file exists.
-    require_out_folder(collection.out, _DEMONSTRATIONS)
-    require_own_summary(collection.out / SUMMARY, "expert", "first_seed")
+    require_demonstrations_folder(collection.out)
     with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
         _require_fitting_expert(collection, env)
         _refuse_other_settings(collection, world_of(env).xml_hash)
@@ -317,6 +316,16 @@ _DEMONSTRATIONS = FolderKind(
     _holds_an_episode,
     begun=lambda path: path.name == FAILED_FOLDER and path.is_dir(),
 )
+
+
+def require_demonstrations_folder(out: Path) -> None:
+    """Make sure that demonstrations can be written to a folder and that nothing is lost by it.
+
+    Raises:
+        RequestError: the folder holds something else, or cannot be written to.
+    """
+    require_out_folder(out, _DEMONSTRATIONS)
+    require_own_summary(out / SUMMARY, "expert", "first_seed")
 
 
 def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:

@@ -411,7 +411,10 @@ def require_out_file(
     for given in filter(None, inputs):
         is_same = mode is not None and given.exists() and out.samefile(given)
         if is_same or out.resolve() == given.resolve():
-            raise RequestError(f"{option} {out}: is '{given}', another file of this command")
+            raise RequestError(
+                f"{option} {out}: is '{given}', which this command reads or writes, too; name "
+                "another file"
+            )
         if given.is_dir() and out.resolve().is_relative_to(given.resolve()):
             raise RequestError(
                 f"{option} {out}: is in '{given}', which is read; name a file elsewhere"
