@@ -109,8 +109,8 @@ def run_command(
             code = _say(f"error: {problem}", EXIT_WRONG_REQUEST)
         elif reason := disk_problem(error):
             file = getattr(error, "filename", None)
-            where = f"'{_text(file)}'" if file else "the output"
-            code = _say(f"error: cannot read or write {where}: {reason}", EXIT_FAILED)
+            what = f"read or write '{_text(file)}'" if file else "write the output"
+            code = _say(f"error: cannot {what}: {reason}", EXIT_FAILED)
         else:
             traceback.print_exc()
             code = EXIT_FAILED
