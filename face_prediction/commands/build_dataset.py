@@ -20,6 +20,8 @@ from face_prediction.dataset.build import (
 from face_prediction.dataset.manifest import (
     CLIP_FOLDER,
     MANIFEST_NAME,
+    TABLE_NAME,
+    TABLE_START,
     ClipEntry,
     Manifest,
     assign_folds,
@@ -164,11 +166,10 @@ def _is_dataset(folder: Path) -> bool:
 
 
 def _is_begun(path: Path) -> bool:
-    return (
-        path.name == CLIP_FOLDER
-        and path.is_dir()
-        and not set(path.iterdir()) - {*path.glob("*.h5"), *path.glob(".*.partial")}
-    )
+    if path.name == TABLE_NAME:
+        return path.is_file() and path.read_bytes().startswith(TABLE_START.encode())
+    names = [item.name for item in path.iterdir()] if path.is_dir() else [""]
+    return path.name == CLIP_FOLDER and all(name.endswith((".h5", ".partial")) for name in names)
 
 
-DATASET = FolderKind("a dataset", _is_dataset, begun=_is_begun)
+DATASET = FolderKind("dataset", _is_dataset, begun=_is_begun)

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 SCHEMA, VERSION = "face_surface", 1
 
-_SURFACE = FileKind("a face surface", lambda path: read_npz(path, SCHEMA, VERSION))
+_SURFACE = FileKind("face surface", lambda path: read_npz(path, SCHEMA, VERSION))
 
 _CHIN = 152
 _METHOD = (

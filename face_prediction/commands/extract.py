@@ -95,7 +95,7 @@ def extract_one(
     """
     settings = options.settings
     require_video(video)
-    require_out_file(out, FileKind("a face track", Path.stat), [video, model])
+    require_out_file(out, FileKind("face track", Path.stat), [video, model])
     with (
         locked_file(out, wait=True),
         # a detector for each video: in video mode its clock may not run backwards

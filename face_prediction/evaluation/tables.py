@@ -104,7 +104,7 @@ def _is_evaluation(folder: Path) -> bool:
     return path.exists() and read_json(path).get("schema") == SCHEMA
 
 
-EVALUATION = FolderKind("an evaluation of face-prediction evaluate", _is_evaluation)
+EVALUATION = FolderKind("evaluation of face-prediction evaluate", _is_evaluation)
 
 
 def markdown_text(report: EvaluationReport) -> str:

@@ -26,7 +26,7 @@ from face_prediction.models.settings import make_predictor_model, settings_class
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file, read_json, write_json
+from robo_manip_baselines.runs.files import atomic_file, read_json, text_path, write_json
 
 try:
     import safetensors
@@ -274,7 +274,10 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     """
     _require_file(path)
     try:
-        with safetensors.safe_open(path, framework="pt", device="cpu") as file:
+        with (
+            text_path(path) as name,
+            safetensors.safe_open(name, framework="pt", device="cpu") as file,
+        ):
             # cloned: tensors must not change when the file is replaced
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
             record = json.loads(file.metadata()["record"])

@@ -194,7 +194,7 @@ def attributed_tracks(tracks: Iterable[Path], table: Path | None) -> list[tuple[
     return [(path, rows[path.stem]) for path in paths]
 
 
-MOTION_LIBRARY = FileKind("a motion library", lambda path: read_npz(path, SCHEMA, VERSION))
+MOTION_LIBRARY = FileKind("motion library", lambda path: read_npz(path, SCHEMA, VERSION))
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,7 @@ def require_report(path: Path, inputs: Iterable[Path | None], clips: Iterable[st
         RequestError: the page is not one of ours, is an input, or a plot that it does not show is
             in the way.
     """
-    require_out_file(path, FileKind("a page", read_page), inputs, option="--report")
+    require_out_file(path, FileKind("page", read_page), inputs, option="--report")
     ours = read_page(path).split(BEGIN)[1].split(END)[0]
     for clip in clips:
         plot = plot_path(path, clip)

@@ -239,7 +239,7 @@ def _is_begun(path: Path) -> bool:
     )
 
 
-_RUN = FolderKind("a run of face-prediction train", _is_run, begun=_is_begun)
+_RUN = FolderKind("run of face-prediction train", _is_run, begun=_is_begun)
 
 
 def _previous_state(

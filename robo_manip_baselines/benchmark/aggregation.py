@@ -170,4 +170,4 @@ def _is_benchmark(folder: Path) -> bool:
     return items.is_dir() and all(path.name in KINDS for path in items.iterdir())
 
 
-BENCHMARK = FolderKind("a benchmark of bin/Benchmark.py", _is_benchmark)
+BENCHMARK = FolderKind("benchmark of bin/Benchmark.py", _is_benchmark)

@@ -32,6 +32,7 @@ from robo_manip_baselines.runs.checkpoints import (
     write_json,
 )
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import text_path
 
 if TYPE_CHECKING:
     import torch
@@ -146,7 +147,8 @@ def load_model(checkpoint: Checkpoint, device: torch.device | str = "cpu") -> Po
 
     config = without_initial_weights(checkpoint.config)
     model = make_model(checkpoint.policy, config, checkpoint.dims)
-    state = safetensors.torch.load_file(checkpoint.folder / MODEL)
+    with text_path(checkpoint.folder / MODEL) as path:
+        state = safetensors.torch.load_file(path)
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
@@ -196,8 +198,10 @@ def write_checkpoint(
         "settings": dataclasses.asdict(checkpoint.settings),
     }
     with checkpoint_folder(folder) as temporary:
-        safetensors.torch.save_file(_on_cpu(model_state), temporary / MODEL)
-        safetensors.torch.save_file(_on_cpu(trainer_tensors), temporary / TRAINER_TENSORS)
+        for name, tensors in ((MODEL, model_state), (TRAINER_TENSORS, trainer_tensors)):
+            (temporary / name).touch()
+            with text_path(temporary / name) as path:
+                safetensors.torch.save_file(_on_cpu(tensors), path)
         write_json(temporary / CONFIG, config)
         write_json(temporary / STATS, checkpoint.normalization.to_json())
         write_json(temporary / TRAINER, trainer)
@@ -214,7 +218,8 @@ def read_trainer(checkpoint: Checkpoint) -> tuple[dict[str, Tensor], dict[str, A
     import safetensors.torch
 
     digests = read_manifest(checkpoint.folder)
-    tensors = safetensors.torch.load_file(verify(checkpoint.folder, digests, TRAINER_TENSORS))
+    with text_path(verify(checkpoint.folder, digests, TRAINER_TENSORS)) as path:
+        tensors = safetensors.torch.load_file(path)
     return tensors, read_json(verify(checkpoint.folder, digests, TRAINER))
 
 

@@ -312,7 +312,7 @@ def _holds_an_episode(folder: Path) -> bool:
 
 
 _DEMONSTRATIONS = FolderKind(
-    "a folder of demonstrations",
+    "demonstrations",
     _holds_an_episode,
     begun=lambda path: path.name == FAILED_FOLDER and path.is_dir(),
 )

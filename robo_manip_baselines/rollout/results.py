@@ -44,7 +44,7 @@ RESULTS = "results.jsonl"
 MANIFEST = "evaluation.json"
 SUMMARY = "summary.json"
 
-_EVALUATION = FolderKind("an evaluation of bin/Rollout.py", lambda path: (path / MANIFEST).exists())
+_EVALUATION = FolderKind("evaluation of bin/Rollout.py", lambda path: (path / MANIFEST).exists())
 
 CONFIDENCE = 0.95
 """of all intervals."""
@@ -250,7 +250,7 @@ def require_own_summary(path: Path, *names: str) -> None:
         if missing := [name for name in names if name not in read_json(path)]:
             raise RequestError(f"'{path}' has no '{missing[0]}': another program made it")
 
-    require_out_file(path, FileKind("a summary", read))
+    require_out_file(path, FileKind("summary", read))
 
 
 @contextmanager

@@ -320,6 +320,20 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
+@contextmanager
+def text_path(path: Path) -> Iterator[str]:
+    """Yield a path to a file as UTF-8 text, for libraries that take no other bytes.
+
+    Raises:
+        OSError: the file cannot be opened.
+    """
+    if _SURROGATE.search(str(path)) is None:
+        yield str(path)
+    else:
+        with path.open("rb") as file:
+            yield f"/dev/fd/{file.fileno()}"
+
+
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file, 64 hexadecimal digits."""
     digest = hashlib.sha256()
@@ -361,7 +375,7 @@ class FileKind:
     """Kind of file that a command makes.
 
     Attributes:
-        name: with its article, for messages.
+        name: for messages.
         read: raises RequestError for a file of any other kind; only what it takes is replaced.
         suffix: that the name must have; empty: any.
     """
@@ -376,7 +390,7 @@ class FolderKind:
     """Kind of folder that a command makes.
 
     Attributes:
-        name: with its article, for messages.
+        name: for messages.
         is_own: returns whether a folder is of this kind, by files with a schema; may raise
             RequestError.
         begun: returns whether a path in a folder is what the command makes first, so that it may
@@ -420,7 +434,7 @@ def require_out_file(
                 f"{option} {out}: is in '{given}', which is read; name a file elsewhere"
             )
     if kind.suffix and out.suffix.lower() != kind.suffix:
-        raise RequestError(f"{option} {out}: {kind.name} is written; name a file *{kind.suffix}")
+        raise RequestError(f"{option} {out}: is no {kind.name}; name an {kind.suffix} file")
     if mode is not None:
         try:
             kind.read(out)
@@ -465,7 +479,7 @@ def require_out_folder(
                 names = sorted(path.name for path in others)
                 listed = ", ".join([*names[:3], *["..."] * (len(names) > 3)])
                 raise RequestError(
-                    f"{option} {out}: holds {listed} and is not {kind.name}; name a new folder"
+                    f"{option} {out}: holds {listed} and no {kind.name}; name another folder"
                 )
     _require_writable(out, out, option)
 

@@ -28,4 +28,4 @@ def require_own_video(path: Path) -> None:
         raise RequestError(f"'{path}' is a video that another program or an earlier release made")
 
 
-VIDEO = FileKind("an H.264 video", require_own_video, ".mp4")
+VIDEO = FileKind("H.264 video", require_own_video, ".mp4")

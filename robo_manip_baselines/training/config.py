@@ -218,7 +218,7 @@ def _is_run(folder: Path) -> bool:
         return False
 
 
-RUN = FolderKind("a run of bin/Train.py", _is_run)
+RUN = FolderKind("run of bin/Train.py", _is_run)
 
 
 def require_same_config(run: Path, config: TrainConfig[Any]) -> None:

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from robo_manip_baselines.policy.checkpoint import MODEL, Checkpoint, read_trainer
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import TrainSettings
+from robo_manip_baselines.runs.files import text_path
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -176,7 +177,8 @@ class TrainerState:
         Raises:
             RequestError: the checkpoint lacks the trainer's state, or it is damaged.
         """
-        weights = safetensors.torch.load_file(checkpoint.folder / MODEL)
+        with text_path(checkpoint.folder / MODEL) as path:
+            weights = safetensors.torch.load_file(path)
         tensors, json = read_trainer(checkpoint)
         if self.average:
             self.average.model.load_state_dict(weights)

@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import text_path
 
 STRIDE = 32
 """Pixels of the image to a cell of the last feature map."""
@@ -196,7 +197,8 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise RequestError(f"backbone_weights '{path}': there is no such file")
     try:
         if path.suffix == ".safetensors":
-            return load_file(path)
+            with text_path(path) as name:
+                return load_file(name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about the age of the file's format
             found = torch.load(path, map_location="cpu", weights_only=True)
