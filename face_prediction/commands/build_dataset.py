@@ -21,6 +21,7 @@ from face_prediction.dataset.manifest import (
     CLIP_FOLDER,
     MANIFEST_NAME,
     TABLE_NAME,
+    TABLE_START,
     ClipEntry,
     Manifest,
     assign_folds,
@@ -34,7 +35,7 @@ from face_prediction.dataset.sequences import SequenceSettings, kind_of
 from face_prediction.motion.attribution import Attribution, find_row, read_attributions
 from face_prediction.motion.library import track_files
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import require_out_folder
+from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +82,12 @@ def run_build_dataset(options: BuildDatasetOptions) -> int:
             people's.
     """
     require_fold_options(options.folds, options.seed)
-    refuse_other_folder(options.out)
+    require_out_folder(options.out, DATASET, [*options.tracks, *options.videos])
+    with locked(options.out):
+        return _build_dataset(options)
+
+
+def _build_dataset(options: BuildDatasetOptions) -> int:
     paths = track_files(options.tracks)
     videos = find_videos(options.videos)
     rows = read_rows(paths, options.attribution)
@@ -151,18 +157,21 @@ def refuse_same_video(entries: Iterable[ClipEntry]) -> None:
             )
 
 
-def refuse_other_folder(out: Path) -> None:
-    """Raise RequestError unless ``out`` is new, empty, or a dataset, whole or begun."""
-    require_out_folder(out)
-    if (out / MANIFEST_NAME).exists():
-        try:
-            read_manifest(out)
-        except RequestError as error:
-            raise RequestError(f"{error}; it is in the way of --out, so remove it first") from None
-    elif out.is_dir():
-        ours = (CLIP_FOLDER, TABLE_NAME)
-        names = [path.name for path in out.iterdir() if path.name not in ours]
-        others = sorted(name for name in names if not name.endswith(".partial"))
-        if others:
-            content = f"holds {', '.join(others[:3])} and no dataset"
-            raise RequestError(f"--out {out}: {content}; name another folder")
+def _is_dataset(folder: Path) -> bool:
+    if not (folder / MANIFEST_NAME).exists():
+        return False
+    try:
+        read_manifest(folder)
+    except RequestError as error:
+        raise RequestError(f"{error}; it is in the way of --out, so remove it first") from None
+    return True
+
+
+def _is_begun(path: Path) -> bool:
+    if path.name == TABLE_NAME:
+        return path.is_file() and path.read_bytes().startswith(TABLE_START.encode())
+    names = [item.name for item in path.iterdir()] if path.is_dir() else [""]
+    return path.name == CLIP_FOLDER and all(name.endswith((".h5", ".partial")) for name in names)
+
+
+DATASET = FolderKind("dataset", _is_dataset, begun=_is_begun)

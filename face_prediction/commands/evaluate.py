@@ -29,6 +29,7 @@ from face_prediction.evaluation.setup import (
 )
 from face_prediction.evaluation.statistics import summarise_kind
 from face_prediction.evaluation.tables import (
+    EVALUATION,
     EvaluationReport,
     markdown_table_1,
     write_evaluation_report,
@@ -37,7 +38,7 @@ from face_prediction.evaluation.video import write_forecast_video
 from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import file_digest, require_out_folder
+from robo_manip_baselines.runs.files import file_digest, locked, require_out_folder
 
 logger = logging.getLogger(__name__)
 
@@ -90,6 +91,11 @@ def run_evaluate(options: EvaluateOptions) -> int:
         RequestError: dataset, checkpoints and options do not go together.
     """
     check_evaluate_options(options)
+    with locked(options.out):
+        return _evaluate(options)
+
+
+def _evaluate(options: EvaluateOptions) -> int:
     with ExitStack() as stack:
         dataset = stack.enter_context(FaceDataset(options.dataset))
         stack.enter_context(logging_redirect_tqdm())
@@ -155,7 +161,7 @@ def check_evaluate_options(options: EvaluateOptions) -> None:
     model = options.detector_model
     if model is not None and not model.is_file():
         raise RequestError(f"--detector_model {model}: no such file")
-    require_out_folder(options.out)
+    require_out_folder(options.out, EVALUATION, [options.dataset, *options.checkpoints])
 
 
 def open_detector(model: Path | None) -> FaceDetector:

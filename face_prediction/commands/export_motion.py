@@ -9,13 +9,15 @@ from pathlib import Path
 import tyro
 
 from face_prediction.motion.library import (
+    MOTION_LIBRARY,
     lift_clips,
     record_motion,
-    refuse_other_files,
     save_motion,
+    track_files,
 )
 from face_prediction.motion.motion import MotionSettings
-from face_prediction.motion.report import read_page, write_report
+from face_prediction.motion.report import require_report, write_report
+from robo_manip_baselines.runs.files import require_out_file
 
 logger = logging.getLogger(__name__)
 
@@ -51,9 +53,11 @@ def run_export_motion(options: ExportMotionOptions) -> None:
     Raises:
         RequestError: a track or the table cannot be used, or no run is left.
     """
-    refuse_other_files(options.out)
+    inputs = [*options.tracks, options.attribution]
     if options.report is not None:
-        read_page(options.report)  # refused now rather than when all is done
+        clips = [path.stem for path in track_files(options.tracks)]
+        require_report(options.report, [*inputs, options.out], clips)
+    require_out_file(options.out, MOTION_LIBRARY, inputs)
     clips, withheld = lift_clips(options.tracks, options.attribution, options.settings)
     library = record_motion(clips, options.settings, withheld)
     save_motion(options.out, library)

@@ -35,7 +35,7 @@ from face_prediction.motion.library import load_motion
 from face_prediction.prediction.errors import mouth_residuals
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import require_out_file
+from robo_manip_baselines.runs.files import FileKind, require_out_file
 from robo_manip_baselines.runs.progress import ProgressBar
 
 logger = logging.getLogger(__name__)
@@ -96,7 +96,8 @@ def run_export_stats(options: ExportStatsOptions) -> int:
         RequestError: dataset or predictor cannot be used, or nothing is left to measure.
     """
     camera = Camera(options.fov_x_deg, options.fov_y_deg, options.depth_m)
-    require_out_file(options.out, load_predictor_error_stats)
+    inputs = [options.dataset, options.library, *options.checkpoints]
+    require_out_file(options.out, FileKind("error statistics", load_predictor_error_stats), inputs)
     if options.max_run_frames is not None and options.max_run_frames < 1:
         raise RequestError(f"--max_run_frames {options.max_run_frames}: 1 or more")
     with FaceDataset(options.dataset) as dataset:

@@ -19,12 +19,14 @@ from face_prediction.motion.library import attributed_tracks
 from face_prediction.motion.surface import facing_out, measure, mediapipe_topology, metric_landmarks
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import require_out_file
-from robo_manip_baselines.runs.npz import write_npz
+from robo_manip_baselines.runs.files import FileKind, require_out_file
+from robo_manip_baselines.runs.npz import read_npz, write_npz
 
 logger = logging.getLogger(__name__)
 
 SCHEMA, VERSION = "face_surface", 1
+
+_SURFACE = FileKind("face surface", lambda path: read_npz(path, SCHEMA, VERSION))
 
 _CHIN = 152
 _METHOD = (
@@ -71,7 +73,8 @@ def run_export_surface(options: ExportSurfaceOptions) -> None:
     if options.max_frames < 1 or options.min_frames < 2:
         given = f"--max_frames {options.max_frames} --min_frames {options.min_frames}"
         raise RequestError(f"{given}: at least 1 and 2 are needed")
-    require_out_file(options.out)
+    inputs = [*options.tracks, options.attribution]
+    require_out_file(options.out, _SURFACE, inputs)
     clips: list[Attribution] = []
     subjects: dict[str, list[np.ndarray]] = defaultdict(list)  # faces (T, 468, 3) of each clip
     for path, row in attributed_tracks(options.tracks, options.attribution):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -15,13 +14,16 @@ from face_prediction.tracking.detector import FaceDetector, find_model
 from face_prediction.tracking.extract import ExtractSettings, extract_track, is_track_up_to_date
 from face_prediction.tracking.tracks import FaceTrack, save_track
 from face_prediction.tracking.video import require_video
-from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import file_digest, require_out_folder
+from robo_manip_baselines.runs.errors import RequestError, WriteError, disk_problem
+from robo_manip_baselines.runs.files import (
+    FileKind,
+    file_digest,
+    locked_file,
+    require_out_file,
+    require_out_folder,
+)
 
 logger = logging.getLogger(__name__)
-
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ENOMEM)
-"""Errors that the next video would meet, too."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,8 @@ def run_extract(options: ExtractOptions) -> int:
 
     Raises:
         RequestError: nothing could be started.
-        OSError: there is no room to write tracks.
+        WriteError: there is no room to write tracks.
     """
-    settings = options.settings
     outputs = output_paths(options.videos, options.out)
     model = find_model(options.model)
     made = kept = 0
@@ -68,16 +69,7 @@ def run_extract(options: ExtractOptions) -> int:
     for number, (video, out) in enumerate(outputs, start=1):
         prefix = f"[{number}/{len(outputs)}] "
         try:
-            require_video(video)
-            # a detector for each video: in video mode its clock may not run backwards
-            with FaceDetector(model, settings.detector) as detector, logging_redirect_tqdm():
-                if is_track_up_to_date(out, file_digest(video), settings, detector.description()):
-                    kept += 1
-                    logger.info("%s%s: up to date", prefix, out)
-                    continue
-                label = prefix + video.name if options.progress else None
-                track = extract_track(video, detector, settings, label)
-            save_track(out, track)
+            track = extract_one(video, out, model, options, prefix)
         except RequestError as error:
             if len(outputs) == 1:
                 raise
@@ -85,11 +77,16 @@ def run_extract(options: ExtractOptions) -> int:
             logger.error("%s%s", prefix, error)
             continue
         except Exception as error:
-            if len(outputs) == 1 or getattr(error, "errno", None) in NO_ROOM:
+            # The next video would meet a full disk, too.
+            if len(outputs) == 1 or isinstance(error, WriteError) or disk_problem(error):
                 raise
             failed.append(video.name)
             logger.error("%s%s: %s: %s", prefix, video, type(error).__name__, error)
             logger.debug("", exc_info=True)
+            continue
+        if track is None:
+            kept += 1
+            logger.info("%s%s: up to date", prefix, out)
             continue
         made += 1
         logger.info("%s%s: %s", prefix, out, summary(track))
@@ -112,6 +109,31 @@ def summary(track: FaceTrack) -> str:
 def named(what: str, names: Sequence[str]) -> str:
     """Count and names of the videos with one result."""
     return f"{len(names)} {what}" + (f" ({', '.join(names)})" if names else "")
+
+
+def extract_one(
+    video: Path, out: Path, model: Path, options: ExtractOptions, prefix: str
+) -> FaceTrack | None:
+    """Write the track of one video and return it; None: it is there already.
+
+    Raises:
+        RequestError: the video cannot be used, or something else is at ``out``.
+    """
+    settings = options.settings
+    require_video(video)
+    require_out_file(out, FileKind("face track", Path.stat), [video, model])
+    with (
+        locked_file(out, wait=True),
+        # a detector for each video: in video mode its clock may not run backwards
+        FaceDetector(model, settings.detector) as detector,
+        logging_redirect_tqdm(),
+    ):
+        if is_track_up_to_date(out, file_digest(video), settings, detector.description()):
+            return None
+        label = prefix + video.name if options.progress else None
+        track = extract_track(video, detector, settings, label)
+        save_track(out, track)
+        return track
 
 
 def output_paths(videos: Iterable[Path], out: Path) -> list[tuple[Path, Path]]:

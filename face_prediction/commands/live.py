@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -21,7 +21,8 @@ from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoReader, require_video
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import require_out_file
+from robo_manip_baselines.runs.files import locked_file, require_out_file
+from robo_manip_baselines.runs.videos import VIDEO
 
 logger = logging.getLogger(__name__)
 
@@ -82,6 +83,8 @@ def run_live(options: LiveOptions) -> int:
     statistics = LiveStatistics()
     code = 0
     with ExitStack() as stack:
+        if options.out is not None:
+            stack.enter_context(locked_file(options.out))
         sink = window_sink() if options.out is None else video_sink(options.out, rate)
         show = stack.enter_context(sink)
         find = stack.enter_context(face_finder(model))
@@ -115,11 +118,10 @@ def check_live_options(options: LiveOptions) -> None:
         require_video(video)
     if out is None:
         return
-    require_out_file(out)
-    if out.suffix.lower() != ".mp4":
-        raise RequestError(f"--out {out}: name an .mp4 file")
-    if video is not None and out.exists() and out.samefile(video):
-        raise RequestError(f"--out {out}: is the video itself; name another file")
+    with suppress(OSError):  # there is no such file
+        if video is not None and out.samefile(video):
+            raise RequestError(f"--out {out}: is the video itself; name another file")
+    require_out_file(out, VIDEO, [options.detector_model])
 
 
 def load_forecaster(

@@ -27,12 +27,12 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings, clip_frames
 from face_prediction.evaluation.predictors import batch_size, cross_fit
 from face_prediction.motion.library import (
+    MOTION_LIBRARY,
     LiftedClip,
     RecordedMotion,
     lift_clips,
     load_motion,
     record_motion,
-    refuse_other_files,
     save_motion,
 )
 from face_prediction.motion.motion import MotionSettings
@@ -40,7 +40,7 @@ from face_prediction.motion.report import markdown_table
 from face_prediction.prediction.interface import Predictor
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import file_digest
+from robo_manip_baselines.runs.files import file_digest, locked_file, require_out_file
 from robo_manip_baselines.runs.progress import ProgressBar
 
 logger = logging.getLogger(__name__)
@@ -92,7 +92,13 @@ def run_predict(options: PredictOptions) -> int:
         RequestError: a file cannot be used, they do not belong together, or somebody in the
             library cannot be forecast by a predictor that never saw the person.
     """
-    refuse_other_files(options.out)
+    inputs = [*options.tracks, options.attribution, options.dataset, *options.checkpoints]
+    require_out_file(options.out, MOTION_LIBRARY, [*inputs, options.library])
+    with locked_file(options.out):
+        return _predict(options)
+
+
+def _predict(options: PredictOptions) -> int:
     given = None if options.library is None else load_motion(options.library)
     motion_settings = MotionSettings() if given is None else given.settings()
     videos = find_videos(options.videos)

@@ -19,7 +19,7 @@ import numpy as np
 
 from face_prediction.dataset.sequences import STATISTICS, ClipFrames, Sequences
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.files import atomic_hdf5
 from robo_manip_baselines.runs.hdf5 import IN_USE, READ_ERRORS, attribute_of, dataset_of, open_hdf5
 from robo_manip_baselines.runs.images import REDUCTIONS
 from robo_manip_baselines.runs.npz import add_array, parse_json
@@ -101,7 +101,7 @@ def write_clip(
 
     ``statistics`` are the columns of `STATISTICS`, each (N,), ``record`` sources and settings.
     """
-    with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
+    with atomic_hdf5(path, _HDF5_FORMAT) as file:
         file.attrs["schema"] = SCHEMA
         file.attrs["version"] = VERSION
         counts = {

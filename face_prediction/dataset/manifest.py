@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,12 +12,13 @@ import numpy as np
 
 from face_prediction.dataset.sequences import STATISTICS, SequenceSettings
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file, read_json, write_text
+from robo_manip_baselines.runs.files import atomic_file, read_json, to_json, write_text
 
 SCHEMA = "face_dataset"
 VERSION = 1
 MANIFEST_NAME = "dataset.json"
 TABLE_NAME = "sequences.csv"
+TABLE_START = "clip,number,subject,kind,fold,start"
 CLIP_FOLDER = "clips"
 
 ALL_FOOTAGE = 0.25
@@ -165,8 +165,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
         "subjects": {c.subject: c.fold for c in manifest.clips if c.fold is not None},
         "clips": [asdict(clip) for clip in manifest.clips],
     }
-    text = json.dumps(content, indent=1, ensure_ascii=False)
-    write_text(folder / MANIFEST_NAME, text + "\n")
+    write_text(folder / MANIFEST_NAME, to_json(content, indent=1))
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -238,7 +237,7 @@ def write_table(folder: Path, rows: Sequence[SequenceRow]) -> None:
         temporary.open("w", encoding="utf-8", newline="") as stream,
     ):
         table = csv.writer(stream, lineterminator="\n")
-        table.writerow(["clip", "number", "subject", "kind", "fold", "start", *STATISTICS])
+        table.writerow([*TABLE_START.split(","), *STATISTICS])
         for row in rows:
             place = [row.clip, row.number, row.subject, row.kind, row.fold, row.start]
             table.writerow([*place, *(f"{row.statistics[name]:.6g}" for name in STATISTICS)])

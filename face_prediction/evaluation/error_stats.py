@@ -7,7 +7,6 @@ holds U and V, in crops.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from face_prediction.prediction.errors import Floats, has_forecast, mouth_errors
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import read_json, write_text
+from robo_manip_baselines.runs.files import read_json, to_json, write_text
 
 SCHEMA = "error_stats"
 VERSION = 1
@@ -243,10 +242,10 @@ def load_predictor_error_stats(path: Path) -> PredictorErrorStats:
 
 def compact_json(record: Mapping[str, Any]) -> str:
     """JSON with the numbers of an innermost list side by side: shorter, and readable."""
-    text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
+    text = to_json(record, indent=1)
     # in JSON only the layout has line breaks, so no text is touched
     inner = re.compile(r"\[\n\s*([-+0-9.eE,\snul]+?)\n\s*\]")
-    return inner.sub(lambda match: f"[{' '.join(match[1].split())}]", text) + "\n"
+    return inner.sub(lambda match: f"[{' '.join(match[1].split())}]", text)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from face_prediction.evaluation.error_stats import compact_json
 from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
-from robo_manip_baselines.runs.files import write_text
+from robo_manip_baselines.runs.files import FolderKind, read_json, write_text
 
 Format = Callable[[float], str]
 Column = tuple[str, tuple[Any, ...], Format, str | None]
@@ -64,6 +64,8 @@ SSIM: scikit-image, Gaussian window of 1.5 pixels, in colour. All images are com
 the smallest that any row makes, larger ones brought there by averaging areas; persistence copies
 the last image. Rows of the paper are its printed figures, from its own recordings."""
 
+RESULTS = "results.json"
+
 _NOTHING = "–"
 _DIGITS = 9  # significant digits in CSV and JSON: more than the bootstrap is good for
 
@@ -91,10 +93,18 @@ def write_evaluation_report(folder: Path, report: EvaluationReport) -> None:
     Raises:
         RequestError: the folder cannot be written to.
     """
+    write_text(folder / RESULTS, results_json(report))  # first: by it the folder is known as ours
     write_text(folder / "tables.md", markdown_text(report))
     write_text(folder / "table1.csv", _table_1_csv(report))
     write_text(folder / "table2.csv", _table_2_csv(report))
-    write_text(folder / "results.json", results_json(report))
+
+
+def _is_evaluation(folder: Path) -> bool:
+    path = folder / RESULTS
+    return path.exists() and read_json(path).get("schema") == SCHEMA
+
+
+EVALUATION = FolderKind("evaluation of face-prediction evaluate", _is_evaluation)
 
 
 def markdown_text(report: EvaluationReport) -> str:

@@ -30,6 +30,7 @@ from face_prediction.prediction.errors import mouth_distances
 from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.videos import METADATA
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -76,6 +77,7 @@ def h264_file(
         # the index goes to the front, so that a browser starts to play before all has arrived
         av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container,
     ):
+        container.metadata.update(METADATA)
         stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "20", "preset": preset}

@@ -24,7 +24,7 @@ from face_prediction.motion.motion import (
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES, continuous_quaternions
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import require_out_file
+from robo_manip_baselines.runs.files import FileKind
 from robo_manip_baselines.runs.npz import ArrayType, FileType, read_json_array, read_npz, write_npz
 
 SCHEMA = "recorded_face_motion"
@@ -113,9 +113,7 @@ def attributed_tracks(tracks: Iterable[Path], table: Path | None) -> list[tuple[
     return found
 
 
-def refuse_other_files(out: Path) -> None:
-    """Raise RequestError if ``out`` is a folder, or a file of another kind."""
-    require_out_file(out, lambda path: read_npz(path, LIBRARY_FILE))
+MOTION_LIBRARY = FileKind("motion library", lambda path: read_npz(path, LIBRARY_FILE))
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,13 @@ from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import SequenceWindows, WindowBatch, augment, window_batches
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import file_digest, locked, remove_temporaries
+from robo_manip_baselines.runs.files import (
+    FolderKind,
+    file_digest,
+    locked,
+    remove_temporaries,
+    require_out_folder,
+)
 from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
@@ -68,6 +74,7 @@ def train_predictor(options: FaceTrainOptions) -> int:
     model_settings, settings = options.resolved()
     device = _device(options.device)
     folder = options.folder
+    require_out_folder(folder, _RUN, [options.dataset])
     with ExitStack() as stack:
         stack.enter_context(logging_redirect_tqdm())
         # one for each thread that reads: training's images are read ahead
@@ -218,6 +225,24 @@ class TrainerProgress:
     def result_step(self) -> int:
         """Step whose weights are the result: the best on a held-out fold, else the last."""
         return self.step if self.best_step is None else self.best_step
+
+
+def _is_run(folder: Path) -> bool:
+    path = folder / TRAINER_FILE
+    if path.exists():
+        require_kind(path, read_tensors(path)[1], KIND)
+    # a network without the state of its trainer is refused later, with its reason
+    return path.exists() or (folder / MODEL_FILE).exists()
+
+
+def _is_begun(path: Path) -> bool:
+    lines = read_metrics(path) if path.name == METRICS_FILE else [{}]
+    return all(isinstance(line, dict) and {"kind", "step"} <= line.keys() for line in lines) and (
+        len(lines) == path.read_bytes().count(b"\n")
+    )
+
+
+_RUN = FolderKind("run of face-prediction train", _is_run, begun=_is_begun)
 
 
 def _previous_state(

@@ -24,15 +24,31 @@ from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatisti
 from robo_manip_baselines.benchmark.statistics.conditions import describe_condition
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, read_result_rows
 from robo_manip_baselines.benchmark.tables.table import write_tables
-from robo_manip_baselines.benchmark.work_item import ArtifactStore, WorkItem, item_versions
+from robo_manip_baselines.benchmark.work_item import (
+    ITEMS,
+    KINDS,
+    ArtifactStore,
+    WorkItem,
+    item_versions,
+)
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.rollout.results import RESULTS, read_results
-from robo_manip_baselines.runs.files import write_json, write_text
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import (
+    FolderKind,
+    locked_file,
+    read_json,
+    write_json,
+    write_text,
+)
 from robo_manip_baselines.runs.progress import closing_table
 
 REPORT = "report.html"
 VERSIONS = "versions.json"
 CONFIGS = "configs.json"
+EARLIER_ITEMS = "units"
+"""Folder of the work items of earlier releases."""
+
 TABLES = "tables"
 FIGURES = "figures"
 
@@ -88,6 +104,18 @@ def write_aggregation(
         videos: work items that have drawn episodes.
         command: command line of the benchmark.
     """
+    with locked_file(out / CONFIGS, wait=True):
+        _write_aggregation(plan, store, statistics, out, videos, command)
+
+
+def _write_aggregation(
+    plan: Plan,
+    store: ArtifactStore,
+    statistics: BenchmarkStatistics,
+    out: Path,
+    videos: Mapping[WorkItem, ResultRow],
+    command: str,
+) -> None:
     preset = plan.preset
     drawn = [
         (path, row)
@@ -104,11 +132,13 @@ def write_aggregation(
     }
     title, caution = f"Benchmark {plan.env}", preset.caution
     report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
-    _keep_only(out / TABLES, write_tables(out / TABLES, report.tables))
-    _keep_only(out / FIGURES, write_figures(out / FIGURES, report.figures))
+    written = write_tables(out / TABLES, report.tables)
+    written += write_figures(out / FIGURES, report.figures)
+    _remove_earlier(out, written)
     write_json(out / VERSIONS, item_versions())
     items = {item.folder: dict(item.settings) for item in plan.items()}
-    write_json(out / CONFIGS, {"command": command, "items": items})
+    files = [path.relative_to(out).as_posix() for path in written]
+    write_json(out / CONFIGS, {"command": command, "items": items, "files": files})
     write_report(out / REPORT, report)
 
 
@@ -121,8 +151,22 @@ def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
     return closing_table(rows | {"tables": str(out / TABLES), "report": str(out / REPORT)})
 
 
-def _keep_only(folder: Path, written: Sequence[Path]) -> None:
-    """Remove the files that an earlier, different benchmark has left in a folder."""
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path not in written:
-            path.unlink()
+def _remove_earlier(out: Path, written: Sequence[Path]) -> None:
+    """Remove tables and figures of an earlier, different benchmark, by its list of them."""
+    earlier = read_json(out / CONFIGS).get("files", []) if (out / CONFIGS).exists() else []
+    for path in (out / name for name in earlier):
+        if path.parent in (out / TABLES, out / FIGURES) and path not in written:
+            path.unlink(missing_ok=True)
+
+
+def _is_benchmark(folder: Path) -> bool:
+    if (folder / EARLIER_ITEMS).exists():
+        raise RequestError(
+            f"'{folder}' holds a benchmark of an earlier release, which this one cannot continue; "
+            "choose another --out"
+        )
+    items = folder / ITEMS
+    return items.is_dir() and all(path.name in KINDS for path in items.iterdir())
+
+
+BENCHMARK = FolderKind("benchmark of bin/Benchmark.py", _is_benchmark)

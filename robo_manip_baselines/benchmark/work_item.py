@@ -29,6 +29,9 @@ from robo_manip_baselines.runs.versions import software_versions, source_digest
 ITEMS = "items"
 """Folder, in that of a benchmark, of its work items."""
 
+KINDS = ("demonstrations", "training", "evaluation", "video")
+"""Kinds of work items, folders in ``ITEMS``."""
+
 OUT = "out"
 """Folder, in that of a work item, of its outputs."""
 
@@ -55,7 +58,7 @@ class WorkItem:
     """Part of a benchmark that one process does.
 
     Attributes:
-        kind: ``demonstrations``, ``training``, ``evaluation`` or ``video``.
+        kind: one of ``KINDS``.
         name: unique within its kind.
         function: ``module:name`` of the function that is called with ``settings`` in the item's
             folder.

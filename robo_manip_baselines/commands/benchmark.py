@@ -16,6 +16,7 @@ from pathlib import Path
 import tyro
 
 from robo_manip_baselines.benchmark.aggregation import (
+    BENCHMARK,
     aggregate_results,
     closing_summary,
     videos_to_make,
@@ -41,7 +42,7 @@ from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.runs.command import EXIT_FAILED, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import prepare_folder
+from robo_manip_baselines.runs.files import prepare_folder, require_out_folder
 from robo_manip_baselines.runs.progress import closing_table, duration
 from robo_manip_baselines.runs.versions import source_digest
 from robo_manip_baselines.training.requirements import prepare_pytorch
@@ -52,9 +53,6 @@ write tables and a report. The same command continues where an earlier one was s
 EXAMPLE = "python bin/Benchmark.py feeding --preset smoke"
 
 EXECUTORS = ("local", "ray")
-
-EARLIER_ITEMS = "units"
-"""Folder of the work items of earlier releases."""
 
 logger = logging.getLogger(__name__)
 
@@ -180,15 +178,12 @@ def benchmark(options: BenchmarkOptions) -> int:
     Raises:
         RequestError: the request cannot be met.
     """
+    inputs = [options.conditions_file, options.motion_library, options.error_stats]
+    require_out_folder(options.folder, BENCHMARK, inputs)
     plan = plan_of(options)
     if options.reference:
         names = [condition.name for condition in plan.conditions]
         require_choice("reference condition", options.reference, names)
-    if (options.folder / EARLIER_ITEMS).exists():
-        raise RequestError(
-            f"'{options.folder}' holds a benchmark of an earlier release, which this one cannot "
-            "continue; choose another --out"
-        )
     store = ArtifactStore(options.folder / ITEMS)
     items = plan.items(options.part)
     manifests = [manifest for manifest in map(store.manifest, items) if manifest]

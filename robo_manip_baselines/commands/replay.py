@@ -10,6 +10,8 @@ import tyro
 
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import locked_file, require_out_file
+from robo_manip_baselines.runs.videos import VIDEO
 
 EXAMPLE = "python bin/Replay.py dataset/FeedingEnv/episode_000000.hdf5 --video replay.mp4"
 
@@ -32,6 +34,7 @@ def replay_episodes(options: ReplayOptions) -> int:
     """
     # Imported here: --help needs no simulator.
     from robo_manip_baselines.data import list_episodes
+    from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
     from robo_manip_baselines.rollout.demonstrate import deviation
     from robo_manip_baselines.rollout.videos import write_preview
 
@@ -40,6 +43,10 @@ def replay_episodes(options: ReplayOptions) -> int:
         paths += list_episodes(given) if given.is_dir() else [given]
     if not paths:
         raise RequestError("no episode to replay; name files, or a folder that holds some")
+    if options.video:
+        require_out_file(options.video, VIDEO, paths, option="--video")
+        if problem := opengl_problem():
+            raise RequestError(f"--video {options.video}: {problem}")
     strays = 0
     for path in paths:
         found = deviation(path)
@@ -48,7 +55,8 @@ def replay_episodes(options: ReplayOptions) -> int:
         print(f"{path}: {found.steps} steps, {within}")  # noqa: T201
     print(f"{len(paths) - strays} of {len(paths)} episodes replay bit for bit")  # noqa: T201
     if options.video:
-        write_preview(options.video, paths)
+        with locked_file(options.video):
+            write_preview(options.video, paths)
         print(f"video: {options.video}")  # noqa: T201
     return int(strays > 0)
 

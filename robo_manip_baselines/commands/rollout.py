@@ -16,7 +16,9 @@ from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import require_out_file
 from robo_manip_baselines.runs.progress import closing_table
+from robo_manip_baselines.runs.videos import VIDEO
 
 if TYPE_CHECKING:
     from robo_manip_baselines.policy.checkpoint import Checkpoint
@@ -214,7 +216,7 @@ def record(options: RolloutOptions) -> None:
         RequestError: the request cannot be met.
     """
     from robo_manip_baselines.data import list_episodes
-    from robo_manip_baselines.rollout.demonstrate import collect
+    from robo_manip_baselines.rollout.demonstrate import collect, require_demonstrations_folder
     from robo_manip_baselines.rollout.results import mean_and_sd
     from robo_manip_baselines.rollout.videos import write_preview
 
@@ -224,6 +226,9 @@ def record(options: RolloutOptions) -> None:
     if shown and not options.spec.cameras and (problem := opengl_problem()):
         logger.warning("no preview video: %s", problem)
         shown = 0
+    require_demonstrations_folder(collection.out)
+    if shown:
+        require_out_file(collection.out / PREVIEW, VIDEO, option="--preview")
     summary = collect(collection)
     episodes = list_episodes(collection.out)[:shown]
     rate = summary.steps_per_second

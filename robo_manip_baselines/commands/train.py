@@ -18,9 +18,17 @@ from robo_manip_baselines.policy.registry import policy_names, policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import require_out_folder
 from robo_manip_baselines.runs.metrics import read_metrics
 from robo_manip_baselines.runs.progress import closing_table
-from robo_manip_baselines.training.config import CONFIG, METRICS, Network, TrainConfig, read_config
+from robo_manip_baselines.training.config import (
+    CONFIG,
+    METRICS,
+    RUN,
+    Network,
+    TrainConfig,
+    read_config,
+)
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 logger = logging.getLogger(__name__)
@@ -192,6 +200,7 @@ def main(args: Sequence[str]) -> int:
     """
     prepare_pytorch()
     config = parse_config(args)
+    require_out_folder(config.folder, RUN, [config.demonstrations])
     from robo_manip_baselines.training.device import Processes
     from robo_manip_baselines.training.trainer import train
 

@@ -30,7 +30,7 @@ from robo_manip_baselines.data.schema import (
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, entry_of_id
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.files import atomic_hdf5
 from robo_manip_baselines.runs.hdf5 import (
     READ_ERRORS,
     attribute_of,
@@ -336,7 +336,8 @@ def write_episode(
 
     Raises:
         ValueError: if the content does not fit the table; names everything that is wrong.
-        OSError: if the file cannot be written.
+        RequestError: the folder cannot be created or written to.
+        WriteError: the disk is full, or fails.
     """
     path = Path(path)
     schema = EpisodeSchema.of(entry_of_id(attributes["env_id"]))
@@ -353,7 +354,7 @@ def write_episode(
     if problems:
         raise ValueError(f"episode for '{path}': {'; '.join(problems)}")
     stored["content_sha256"] = stored_text(content_digest(schema, fields, checksums, loaded))
-    with atomic_file(path) as temporary, h5py.File(temporary, "w", libver=_HDF5_FORMAT) as file:
+    with atomic_hdf5(path, _HDF5_FORMAT) as file:
         for item in schema.attributes:
             file.attrs[item.name] = stored[item.name]
         for field in schema.fields:

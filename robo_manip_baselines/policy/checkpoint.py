@@ -32,6 +32,7 @@ from robo_manip_baselines.runs.checkpoints import (
     write_json,
 )
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import text_path
 from robo_manip_baselines.runs.tensors import read_tensors, require_alike, require_finite
 
 if TYPE_CHECKING:
@@ -207,8 +208,10 @@ def write_checkpoint(
         "settings": dataclasses.asdict(checkpoint.settings),
     }
     with checkpoint_folder(folder) as temporary:
-        safetensors.torch.save_file(_on_cpu(model_state), temporary / MODEL)
-        safetensors.torch.save_file(_on_cpu(trainer_tensors), temporary / TRAINER_TENSORS)
+        for name, tensors in ((MODEL, model_state), (TRAINER_TENSORS, trainer_tensors)):
+            (temporary / name).touch()
+            with text_path(temporary / name) as path:
+                safetensors.torch.save_file(_on_cpu(tensors), path)
         write_json(temporary / CONFIG, config)
         write_json(temporary / STATS, checkpoint.normalization.to_json())
         write_json(temporary / TRAINER, trainer)

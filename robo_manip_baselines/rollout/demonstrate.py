@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import json
 import logging
-import signal
+import multiprocessing
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from collections import defaultdict, deque
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +26,7 @@ from robo_manip_baselines.data import (
     remove_partial_episodes,
     write_episode,
 )
-from robo_manip_baselines.data.files import list_failures, seed_of
+from robo_manip_baselines.data.files import FAILED_FOLDER, list_failures, seed_of
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
@@ -39,10 +36,15 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     without_library_path,
 )
 from robo_manip_baselines.policy.presets import require_at_least
-from robo_manip_baselines.rollout.results import completion_time, require_seeds
+from robo_manip_baselines.rollout.results import (
+    completion_time,
+    require_own_summary,
+    require_seeds,
+)
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import prepare_folder, write_json
+from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder, write_json
 from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_image
+from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
 from robo_manip_baselines.runs.progress import EpisodeProgress
 from robo_manip_baselines.runs.versions import software_versions
 
@@ -212,23 +214,32 @@ def collect(collection: Collection) -> CollectionSummary:
     """
     # Everything about the request that can be wrong is found out here, before any file exists.
     collection = replace(collection, env_kwargs=pin_library(collection.env_kwargs))
+    require_demonstrations_folder(collection.out)
     with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
         _require_fitting_expert(collection, env)
         _refuse_other_settings(collection, world_of(env).xml_hash)
-        prepare_folder(collection.out)
-        remove_partial_episodes(collection.out)
-        done = finished_seeds(collection.out)
-        todo = [seed for seed in collection.seeds if seed not in done]
-        if len(todo) < len(collection.seeds):
-            total = len(collection.seeds)
-            logger.info("%d of %d episodes are there already", total - len(todo), total)
-        steps, begin = 0, time.perf_counter()
-        longest = task_entry(collection.env).max_episode_steps
-        with EpisodeProgress(len(todo), longest, collection.expert) as progress:
-            for count in _record_all(collection, env, todo, progress.step):
-                steps += count
-                progress.end(count)
-        elapsed = time.perf_counter() - begin
+        with locked(collection.out):
+            return _collect(collection, env)
+
+
+def _collect(collection: Collection, env: gymnasium.Env[Any, Any]) -> CollectionSummary:
+    """Record what is missing in the folder of a collection, which is held."""
+    remove_partial_episodes(collection.out)
+    done = finished_seeds(collection.out)
+    todo = [seed for seed in collection.seeds if seed not in done]
+    if len(todo) < len(collection.seeds):
+        total = len(collection.seeds)
+        logger.info("%d of %d episodes are there already", total - len(todo), total)
+    steps, begin = 0, time.perf_counter()
+    longest = task_entry(collection.env).max_episode_steps
+    with (
+        EpisodeProgress(len(todo), longest, collection.expert) as progress,
+        contextlib.closing(_record_all(collection, env, todo, progress.step)) as counts,
+    ):
+        for count in counts:
+            steps += count
+            progress.end(count)
+    elapsed = time.perf_counter() - begin
     summary = _summarize(collection.out, steps, steps / elapsed if todo else None)
     content = {
         "env": task_entry(collection.env).env_id,
@@ -260,7 +271,7 @@ def _record_all(
     env: gymnasium.Env[Any, Any],
     seeds: list[int],
     on_steps: Callable[[int], None],
-) -> Iterator[int]:
+) -> Generator[int, None, None]:
     """Record seeds, here or in worker processes; yield the steps of each as it is finished.
 
     ``on_steps`` is called with the number of steps taken since its last call.
@@ -271,21 +282,39 @@ def _record_all(
             yield _record(collection, env, seed, on_steps)
         return
     logger.info("starting %d worker processes", workers)
-    # Spawned, not forked: an OpenGL context does not survive a fork.
-    context = get_context("spawn")
-    counter, seen = context.Value("q", 0), 0
-    pool = ProcessPoolExecutor(workers, context, _start_worker, (collection, counter))
+    counter, seen = multiprocessing.get_context("spawn").Value("q", 0), 0
+    waiting, is_done = deque(seeds), False
+    pool: list[Worker] = []
     try:
-        waiting = {pool.submit(_record_in_worker, seed) for seed in seeds}
-        while waiting:
-            ended, waiting = wait(waiting, POLL, FIRST_COMPLETED)
+        for _ in range(workers):
+            pool.append(Worker(_Recorder, collection, counter))
+            pool[-1].submit(waiting.popleft())
+        busy = list(pool)
+        while busy:
+            ready = wait_for(busy, POLL)
             taken = counter.value
             on_steps(taken - seen)
             seen = taken
-            for future in ended:
-                yield future.result()
+            for worker in ready:
+                yield _receive(worker)
+                if waiting:
+                    worker.submit(waiting.popleft())
+                else:
+                    busy.remove(worker)
+        is_done = True
     finally:
-        pool.shutdown(cancel_futures=True)
+        close_workers(pool, at_once=not is_done)
+        remove_partial_episodes(collection.out)
+
+
+def _receive(worker: Worker) -> int:
+    try:
+        return worker.receive()
+    except WorkerDiedError as error:
+        raise RuntimeError(
+            f"a worker process died ({error}); if it was killed for lack of memory, take fewer "
+            "--workers; the same command records what is missing"
+        ) from error
 
 
 def _record(
@@ -302,24 +331,45 @@ def _record(
     return len(demonstration.arrays["time"])
 
 
-_worker: dict[str, Any] = {}
-"""State of a worker process between episodes; empty in every other process."""
+class _Recorder:
+    """Environment of a worker process: seeds in, numbers of recorded steps out."""
+
+    def __init__(self, collection: Collection, counter: Any) -> None:
+        self._collection, self._counter = collection, counter
+        self._env = make_env(collection.env, **collection.env_kwargs)
+        self.close = self._env.close
+
+    def __call__(self, seed: int) -> int:
+        return _record(self._collection, self._env, seed, self._count_steps)
+
+    def _count_steps(self, count: int) -> None:
+        with self._counter.get_lock():
+            self._counter.value += count
 
 
-def _start_worker(collection: Collection, counter: Any) -> None:
-    # Ctrl-C reaches the whole process group: workers stop at once, the parent does the talking.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    env = make_env(collection.env, **collection.env_kwargs)
-    atexit.register(env.close)
-    _worker.update(collection=collection, env=env, counter=counter)
+def _holds_an_episode(folder: Path) -> bool:
+    for path in [*list_episodes(folder), *list_failures(folder)]:
+        with contextlib.suppress(RequestError):  # damaged, or made by something else
+            read_metadata(path)
+            return True
+    return False
 
 
-def _record_in_worker(seed: int) -> int:
-    def count_steps(count: int) -> None:
-        with _worker["counter"].get_lock():
-            _worker["counter"].value += count
+_DEMONSTRATIONS = FolderKind(
+    "demonstrations",
+    _holds_an_episode,
+    begun=lambda path: path.name == FAILED_FOLDER and path.is_dir(),
+)
 
-    return _record(_worker["collection"], _worker["env"], seed, count_steps)
+
+def require_demonstrations_folder(out: Path) -> None:
+    """Make sure that demonstrations can be written to a folder and that nothing is lost by it.
+
+    Raises:
+        RequestError: the folder holds something else, or cannot be written to.
+    """
+    require_out_folder(out, _DEMONSTRATIONS)
+    require_own_summary(out / SUMMARY, "expert", "first_seed")
 
 
 def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]) -> None:

@@ -32,6 +32,7 @@ from robo_manip_baselines.rollout.results import (
     EpisodeResult,
     EvaluationSummary,
     open_results,
+    require_evaluation_folder,
     require_seeds,
     summarize,
 )
@@ -40,13 +41,15 @@ from robo_manip_baselines.rollout.videos import pick_for_video, video_name, writ
 from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import write_json
+from robo_manip_baselines.runs.files import locked, write_json
 from robo_manip_baselines.runs.progress import EpisodeProgress
 from robo_manip_baselines.runs.versions import software_versions
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 if TYPE_CHECKING:
     import torch
+
+    from robo_manip_baselines.policy.interface import PolicyModel
 
 logger = logging.getLogger(__name__)
 
@@ -272,15 +275,27 @@ class EvaluationPlan:
             "motion_library": self.env.env_kwargs.get("motion_library"),
         }
 
+    @cached_property
+    def model(self) -> PolicyModel:
+        """The network, on its device.
+
+        Raises:
+            RequestError: its weights do not fit it.
+        """
+        return load_model(self.checkpoint, self.device)
+
     def make_policy(self, num_envs: int) -> ActingPolicy:
-        """Load the network and make it act in so many environments."""
+        """Make the network act in so many environments.
+
+        Raises:
+            RequestError: it cannot, as with more action steps than a chunk has.
+        """
         from robo_manip_baselines.policy.execution import PolicyRunner
 
         checkpoint, precision = self.checkpoint, self.config.precision
-        model = load_model(checkpoint, self.device)
         facts = checkpoint.spec, checkpoint.normalization, self.execution
         return PolicyRunner(
-            model, *facts, num_envs=num_envs, device=self.device, precision=precision
+            self.model, *facts, num_envs=num_envs, device=self.device, precision=precision
         )
 
     def run(self, seeds: Sequence[int], on_episode: OnEpisode) -> None:
@@ -333,8 +348,18 @@ def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummar
     Raises:
         RequestError: the folder holds other results, or the request cannot be met.
     """
+    # Everything about the request that can be wrong is found out before any file exists.
     plan = EvaluationPlan.of(config)
+    plan.make_policy(1)
+    require_evaluation_folder(plan.out, plan.settings)
     logger.info("%s", plan)
+    with locked(plan.out):
+        return plan, *_evaluate(plan)
+
+
+def _evaluate(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
+    """Run the episodes that the folder of a plan lacks, write summary and videos."""
+    config = plan.config
     seeds, number, split = config.seeds, config.videos, plan.checkpoint.split
     if known := sorted(set(seeds) & {*split.train, *split.validation}):
         logger.warning(
@@ -378,7 +403,7 @@ def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummar
     plan.run(again, lambda result, recording: recordings.update({result.seed: recording}))
     for path, result in missing.items():
         write_video(path, plan.env, result, recordings[result.seed])
-    return plan, summary, list(videos)
+    return summary, list(videos)
 
 
 def choose_execution(

@@ -12,17 +12,27 @@ import types
 import typing
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.rollout.agreement import require_one_evaluation
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import prepare_folder, read_json, write_json, write_text
+from robo_manip_baselines.runs.files import (
+    AppendFile,
+    FileKind,
+    FolderKind,
+    prepare_folder,
+    read_json,
+    require_out_file,
+    require_out_folder,
+    write_json,
+    write_text,
+)
 from robo_manip_baselines.runs.progress import closing_table
 
 ROW_VERSION = 3
@@ -35,6 +45,8 @@ SCHEMA_VERSION = 1
 RESULTS = "results.jsonl"
 MANIFEST = "evaluation.json"
 SUMMARY = "summary.json"
+
+_EVALUATION = FolderKind("evaluation of bin/Rollout.py", lambda path: (path / MANIFEST).exists())
 
 CONFIDENCE = 0.95
 """of all intervals."""
@@ -212,19 +224,42 @@ class ResultsFile:
         done: results that the folder holds, by seed.
     """
 
-    def __init__(self, file: TextIO, done: dict[int, EpisodeResult]) -> None:
+    def __init__(self, file: AppendFile, done: dict[int, EpisodeResult]) -> None:
         self._file, self.done = file, done
 
     def append(self, result: EpisodeResult) -> None:
         """Write a row; it is on the disk when this returns."""
-        self._file.write(result.to_line() + "\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        self._file.append(f"{result.to_line()}\n".encode())
         self.done[result.seed] = result
 
     def of(self, seeds: Sequence[int]) -> list[EpisodeResult]:
         """Return the results of these seeds, as far as they are there."""
         return [self.done[seed] for seed in seeds if seed in self.done]
+
+
+def require_evaluation_folder(folder: Path, settings: dict[str, Any]) -> None:
+    """Make sure that results of these settings can be written to a folder.
+
+    Raises:
+        RequestError: the folder holds something else, results of other settings, or is damaged.
+    """
+    require_out_folder(folder, _EVALUATION)
+    _refuse_other_settings(folder, settings)
+    require_own_summary(folder / SUMMARY, "condition", "success")
+
+
+def require_own_summary(path: Path, *names: str) -> None:
+    """Make sure that a summary, if there is one, has these names, and so may be replaced.
+
+    Raises:
+        RequestError: it lacks some.
+    """
+
+    def read(path: Path) -> None:
+        if missing := [name for name in names if name not in read_json(path)]:
+            raise RequestError(f"'{path}' has no '{missing[0]}': another program made it")
+
+    require_out_file(path, FileKind("summary", read))
 
 
 @contextmanager
@@ -250,7 +285,7 @@ def open_results(
         write_json(folder / MANIFEST, content)
     if path.exists():  # drop a torn row
         os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
-    with path.open("a", encoding="utf-8") as file:
+    with closing(AppendFile(path, is_flushed=True)) as file:
         yield ResultsFile(file, done)
     write_text(path, "".join(f"{done[seed].to_line()}\n" for seed in sorted(done)))
 

@@ -31,6 +31,7 @@ from robo_manip_baselines.rollout.workers import EnvConfig
 from robo_manip_baselines.runs.files import atomic_file
 from robo_manip_baselines.runs.images import decode_image
 from robo_manip_baselines.runs.progress import track
+from robo_manip_baselines.runs.videos import METADATA
 
 Colour = tuple[int, int, int]
 Item = TypeVar("Item")
@@ -106,6 +107,7 @@ class VideoWriter:
             atomic_file(path) as temporary,
             av.open(str(temporary), "w", format="mp4", options=options) as self._container,
         ):
+            self._container.metadata.update(METADATA)
             self._stream = self._container.add_stream("libx264", rate=rate)
             self._stream.pix_fmt = "yuv420p"
             self._stream.options = {"crf": str(crf), "preset": preset}

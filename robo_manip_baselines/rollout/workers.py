@@ -14,12 +14,8 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import signal
-import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -36,9 +32,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
 from robo_manip_baselines.observation import ARM_JOINTS, ObservationSpec
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.errors import RequestError
-
-_PATIENCE = 5.0
-"""s for a worker to end by itself, when the run is over, before it is killed."""
+from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
 
 
 @dataclass(frozen=True)
@@ -187,13 +181,16 @@ class LocalEnvs:
         return StepResult(number, None)
 
 
-@dataclass
-class _Worker:
-    """Process, the pipe to it, and the requests that it is working on."""
+class _EnvServer:
+    """Environments in a worker process: step requests in, step results out."""
 
-    process: Any
-    pipe: Connection
-    requests: Sequence[StepRequest] = ()
+    def __init__(self, config: EnvConfig, buffer: Any) -> None:
+        self._envs = LocalEnvs(config, np.frombuffer(buffer, config.row_type))
+        self.close = self._envs.close
+
+    def __call__(self, requests: Sequence[StepRequest]) -> list[StepResult]:
+        self._envs.submit(requests)
+        return self._envs.wait()
 
 
 class WorkerEnvs:
@@ -201,19 +198,15 @@ class WorkerEnvs:
 
     def __init__(self, config: EnvConfig, num_envs: int, workers: int) -> None:
         self.config = config
-        # Spawned, not forked: an OpenGL context does not survive a fork.
-        context = multiprocessing.get_context("spawn")
-        buffer = context.RawArray("B", num_envs * config.row_type.itemsize)
+        buffer = multiprocessing.get_context("spawn").RawArray(
+            "B", num_envs * config.row_type.itemsize
+        )
         self.arrays = np.frombuffer(buffer, config.row_type)
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
+        self._requests: dict[Worker, Sequence[StepRequest]] = {}  # of the workers that have some
         try:
             for _ in range(workers):
-                ours, theirs = context.Pipe()
-                process = context.Process(target=_work, args=(theirs, config, buffer), daemon=True)
-                self._workers.append(_Worker(process, ours))
-                with _without_interrupts():
-                    process.start()
-                theirs.close()  # so that the pipe ends when the worker does
+                self._workers.append(Worker(_EnvServer, config, buffer))
         except BaseException:
             self.close()
             raise
@@ -223,9 +216,8 @@ class WorkerEnvs:
         for number, worker in enumerate(self._workers):
             mine = [r for r in requests if r.env_id % len(self._workers) == number]
             if mine:
-                worker.requests = mine
-                with contextlib.suppress(OSError):  # it has died; ``wait`` finds out why
-                    worker.pipe.send(mine)
+                self._requests[worker] = mine
+                worker.submit(mine)
 
     def wait(self) -> list[StepResult]:
         """Wait until some environments have answered, and return the answers.
@@ -234,26 +226,22 @@ class WorkerEnvs:
             RequestError: a worker could not do what was requested.
             RuntimeError: a worker failed or died.
         """
-        busy = [worker for worker in self._workers if worker.requests]
-        ready = wait([worker.pipe for worker in busy])
         answers: list[StepResult] = []
-        for worker in busy:
-            if worker.pipe in ready:
-                answers += _receive(worker)
-                worker.requests = ()
+        for worker in wait_for(list(self._requests)):
+            try:
+                answers += worker.receive()
+            except WorkerDiedError as error:
+                numbers = ", ".join(str(request.env_id) for request in self._requests[worker])
+                raise RuntimeError(
+                    f"the worker process of environments {numbers} died ({error}); if it was "
+                    "killed for lack of memory, take fewer --num_envs or --workers"
+                ) from error
+            del self._requests[worker]
         return answers
 
     def close(self) -> None:
-        """End the workers."""
-        for worker in self._workers:
-            worker.pipe.close()  # a worker ends when it finds that its pipe has
-        for worker in self._workers:
-            if worker.process.pid is not None:
-                worker.process.join(_PATIENCE)
-                if worker.process.is_alive():
-                    worker.process.kill()
-                    worker.process.join()
-                worker.process.close()
+        """End the workers; at once if they are at work."""
+        close_workers(self._workers, at_once=bool(self._requests))
         self._workers.clear()
 
 
@@ -283,63 +271,3 @@ def open_envs(config: EnvConfig, num_envs: int, workers: int) -> Iterator[EnvPoo
     )
     with contextlib.closing(envs):
         yield envs
-
-
-def _receive(worker: _Worker) -> list[StepResult]:
-    """Return the answers of a worker, or raise its error."""
-    try:
-        answer = worker.pipe.recv()
-    except (EOFError, OSError) as error:
-        worker.process.join(_PATIENCE)
-        numbers = ", ".join(str(request.env_id) for request in worker.requests)
-        raise RuntimeError(
-            f"the worker process of environments {numbers} died (exit code "
-            f"{worker.process.exitcode}); if it was killed for lack of memory, take fewer "
-            "--num_envs or --workers"
-        ) from error
-    if isinstance(answer, RequestError):
-        raise answer
-    if isinstance(answer, str):
-        raise RuntimeError(f"a worker process failed:\n{answer}")
-    return answer
-
-
-def _work(pipe: Connection, config: EnvConfig, buffer: Any) -> None:
-    """Carry out requests until the pipe ends; errors are reported through it."""
-    answer: list[StepResult] | RequestError | str
-    with contextlib.closing(LocalEnvs(config, np.frombuffer(buffer, config.row_type))) as here:
-        while True:
-            try:
-                requests = pipe.recv()
-            except (EOFError, OSError):  # the run is over
-                return
-            try:
-                here.submit(requests)
-                answer = here.wait()
-            except RequestError as error:
-                answer = RequestError(str(error))
-            except Exception:
-                answer = traceback.format_exc()
-            try:
-                pipe.send(answer)
-            except OSError:
-                return
-
-
-@contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Let a process that starts here never see Ctrl-C, which reaches the whole process group.
-
-    It would print a traceback of its own; this process ends it. Signals that come meanwhile are
-    seen afterwards.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    # Python starts it with the first process, and lets SIGINT through again while doing so.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

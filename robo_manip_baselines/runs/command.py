@@ -1,11 +1,12 @@
 """Command lines: options parsed into dataclasses, errors as one line, exit codes.
 
-Exit codes: 0 done, 1 something failed that was not the user's doing, 2 the request was wrong,
-130 interrupted.
+Exit codes: 0 done, 1 something failed that was not the user's doing (such as a full disk), 2 the
+request was wrong, 130 interrupted (Ctrl-C, SIGTERM, SIGHUP).
 """
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import difflib
 import inspect
@@ -16,19 +17,33 @@ import re
 import select
 import sys
 import traceback
+import unicodedata
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import UnionType
 from typing import Any, NoReturn, TypeVar, cast
 
 import tyro
 
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, WriteError, disk_problem
+from robo_manip_baselines.runs.interrupt import signals_as_interrupt
 
 Options = TypeVar("Options")
 
 EXIT_FAILED = 1
 EXIT_WRONG_REQUEST = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
+_ASCII = {
+    **{"±": "+-", "×": "x", "–": "-", "—": "-", "−": "-", "…": "...", "°": " degrees"},
+    **{"µ": "u", "μ": "u", "≤": "<=", "≥": ">=", "→": "->", "·": "*"},
+    **dict.fromkeys("‘’", "'"),
+    **dict.fromkeys("“”", '"'),
+    **dict.fromkeys("│┃", "|"),
+    **dict.fromkeys("─━", "-"),
+    **dict.fromkeys("╭╮╰╯┌┐└┘├┤┬┴┼", "+"),
+}
+"""Replacement of characters for a terminal that cannot show them."""
 
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _BOX = re.compile(r"^[\s│|╭╰┌└+]+|[\s│|╮╯┐┘+]+$")
@@ -69,14 +84,18 @@ def run_command(
     Raises:
         SystemExit: always.
     """
+    _prepare_streams()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     # PyOpenGL tells every user that an accelerator, which nothing here needs, is not installed.
     logging.getLogger("OpenGL").setLevel(logging.WARNING)
     try:
-        code = main() or 0
-        sys.stdout.flush()
+        with signals_as_interrupt():
+            code = main() or 0
+            sys.stdout.flush()
     except RequestError as error:
         code = _say(f"error: {_one_line(error)}", EXIT_WRONG_REQUEST)
+    except WriteError as error:
+        code = _say(f"error: {_one_line(error)}", EXIT_FAILED)
     except KeyboardInterrupt:
         code = _say("interrupted", EXIT_INTERRUPTED)
     except SystemExit as stop:
@@ -88,14 +107,14 @@ def run_command(
     except Exception as error:
         if problem := explain and explain(error):
             code = _say(f"error: {problem}", EXIT_WRONG_REQUEST)
+        elif reason := disk_problem(error):
+            file = getattr(error, "filename", None)
+            what = f"read or write '{_text(file)}'" if file else "write the output"
+            code = _say(f"error: cannot {what}: {reason}", EXIT_FAILED)
         else:
             traceback.print_exc()
             code = EXIT_FAILED
-    if _is_reader_gone():
-        # As in `… | head`: what Python would still flush has no reader; an error about it helps
-        # nobody.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(code)
+    sys.exit(_flush(code))
 
 
 def parse(
@@ -127,6 +146,7 @@ def parse(
         SystemExit: with code 0 after ``--help``.
     """
     given = list(sys.argv[1:] if args is None else args)
+    _refuse_empty(given)
     text = _SECTIONS.split(description or inspect.getdoc(options_type) or "")[0].strip()
     if example is not None:
         text += f"\n\nExample: {example}"
@@ -141,6 +161,25 @@ def parse(
             _call_tyro(options_type, text, [*rest, "--help"], default, program)
         raise RequestError(_unknown_message(unknown, page.getvalue(), program))
     return result
+
+
+def _refuse_empty(args: Sequence[str]) -> None:
+    """Refuse empty arguments: they come from shell variables that are not set.
+
+    Raises:
+        RequestError: naming the option.
+    """
+    name = "an argument"
+    for arg in args:
+        option, sign, value = arg.partition("=")
+        is_option = option.startswith("--")
+        if not arg.strip() or (is_option and sign and not value.strip()):
+            what = option if is_option else name
+            raise RequestError(
+                f"{what} '': is empty; give a value (a variable of the shell may not be set), or "
+                "leave it out"
+            )
+        name = option if is_option and not sign else name
 
 
 def last_value(args: Sequence[str], name: str) -> str | None:
@@ -226,15 +265,74 @@ def _one_line(message: object) -> str:
 
 
 def _say(line: str, code: int) -> int:
-    print(line, file=sys.stderr)  # noqa: T201
+    with contextlib.suppress(OSError):  # whoever should read it has gone
+        print(line, file=sys.stderr, flush=True)  # noqa: T201
+    return code
+
+
+def _text(path: object) -> str:
+    return os.fsdecode(path) if isinstance(path, bytes) else str(path)
+
+
+def _prepare_streams() -> None:
+    """Make sure that every text can be written to stdout and stderr, whatever their encoding.
+
+    A stream that the shell has closed becomes the null device.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=_READABLE)
+
+
+def _readable(error: UnicodeError) -> tuple[bytes, int]:
+    """Replace characters that an encoding lacks; bytes of a path that is no UTF-8 stay as they are.
+
+    The error handler of Python's codecs of the name ``_READABLE``.
+    """
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    replaced = b""
+    for character in error.object[error.start : error.end]:
+        if "\udc80" <= character <= "\udcff":  # how Python holds such a byte
+            replaced += character.encode("ascii", "surrogateescape")
+        else:
+            plain = unicodedata.normalize("NFKD", _ASCII.get(character, character))
+            replaced += plain.encode("ascii", "ignore") or b"?"
+    return replaced, error.end
+
+
+_READABLE = "readable"
+codecs.register_error(_READABLE, _readable)
+
+
+def _flush(code: int) -> int:
+    """Write out what is left; return the exit code, which is 1 where that fails.
+
+    As in `… | head`: what Python would still flush has no reader; an error about it helps nobody.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError) as error:
+            if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+                _say(f"error: cannot write the output: {error.strerror or error}", code)
+            code = code or EXIT_FAILED
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
     return code
 
 
 def _is_reader_gone() -> bool:
-    """Return True if stdout is a pipe without a reader."""
-    try:
-        poll = select.poll()
-        poll.register(sys.stdout.fileno(), select.POLLOUT)
-        return any(event & (select.POLLERR | select.POLLNVAL) for _, event in poll.poll(0))
-    except (AttributeError, OSError, ValueError):  # no poll here, or stdout is no file
-        return False
+    """Return True if stdout or stderr is a pipe without a reader."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            poll = select.poll()
+            poll.register(stream.fileno(), select.POLLOUT)
+            if any(event & (select.POLLERR | select.POLLNVAL) for _, event in poll.poll(0)):
+                return True
+        except (AttributeError, OSError, ValueError):  # no poll here, or the stream is no file
+            continue
+    return False

@@ -1,11 +1,17 @@
-"""The one error that means "the request was wrong", and how its message is phrased."""
+"""Errors that are one line without a traceback: a wrong request, and a disk that takes no data."""
 
 from __future__ import annotations
 
 import difflib
+import errno
 import operator
+import os
+import re
 from collections.abc import Iterable
 from typing import Any
+
+_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+_NUMBER = re.compile(r"(?:\[Errno |errno = |os error )(\d+)")  # HDF5 and safetensors say it in text
 
 
 class RequestError(ValueError):
@@ -13,6 +19,27 @@ class RequestError(ValueError):
 
     The message says what was given, what is valid and what to do.
     """
+
+
+class WriteError(RuntimeError):
+    """The disk took no data, though the request was right: one line, no traceback, exit code 1.
+
+    The message names the file and the reason.
+    """
+
+
+def disk_problem(error: BaseException) -> str | None:
+    """Reason for which the disk took no data, if that is the cause of an error; None otherwise."""
+    cause: BaseException | None = error
+    while cause is not None:
+        number = getattr(cause, "errno", None)
+        if not isinstance(number, int):
+            match = _NUMBER.search(str(cause))
+            number = int(match[1]) if match else None
+        if number in _DISK:
+            return os.strerror(number)
+        cause = cause.__cause__ or cause.__context__
+    return None
 
 
 def require_choice(what: str, given: str, valid: Iterable[str]) -> str:

@@ -1,18 +1,49 @@
-"""Ctrl-C and SIGTERM as a request to stop after the step at hand."""
+"""Signals that end a run: Ctrl-C, SIGTERM, and SIGHUP of a terminal that is closed."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
 _NOTICE = b"\nstopping: saving after this step; Ctrl-C again stops at once\n"
 
+ENDING = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+
+
+@contextmanager
+def signals_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP raise KeyboardInterrupt, as Ctrl-C does; once, so that cleaning up
+    is not interrupted.
+
+    Signals that are ignored, as by ``nohup``, stay so.
+    """
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        for other in before:
+            signal.signal(other, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in ENDING:
+            if number != signal.SIGINT and signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
 
 class StopRequest:
-    """While entered, notes SIGINT and SIGTERM.
+    """While entered, notes SIGINT, SIGTERM and SIGHUP as a request to stop after a step.
 
     Args:
         once_more: whether a second Ctrl-C ends the process at once. Not with ``torchrun``, which
@@ -30,8 +61,10 @@ class StopRequest:
     def __enter__(self) -> StopRequest:
         """Take over the signals; only the main thread can."""
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._note)
+            for number in ENDING:
+                # ``nohup`` lets a run outlive its terminal
+                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:

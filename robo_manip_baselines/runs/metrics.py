@@ -6,16 +6,27 @@ the last such line) or ``validation``, and ``step``, the number of steps done.
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import math
+import os
+import socket
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.extras import pip_install
-from robo_manip_baselines.runs.files import atomic_file, write_text
+from robo_manip_baselines.runs.files import AppendFile, atomic_file, disk_errors, write_text
+
+TENSORBOARD = "tensorboard"
+"""Folder of a run with files for TensorBoard."""
+
+EVENTS = "events.out.tfevents"
+EVENTS_SUFFIX = ".run"
+"""Start and end of the names of these files."""
 
 LOGGERS = ("tensorboard", "wandb", "none")
 
@@ -55,15 +66,15 @@ class MetricsLog:
         # lines after the step would be written twice
         kept = [line for line in read_metrics(path) if line["step"] <= step]
         write_text(path, "".join(f"{_to_line(line)}\n" for line in kept))
-        self._file = path.open("a", encoding="utf-8")
+        self._file = AppendFile(path)
         self._board = board
 
     def write(self, kind: str, step: int, values: Mapping[str, float]) -> None:
         """Write a line, at once."""
         # JSON has no NaN: a number that is none is left out.
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
-        self._file.write(_to_line({"kind": kind, "step": step, **finite}) + "\n")
-        self._file.flush()
+        line = _to_line({"kind": kind, "step": step, **finite})
+        self._file.append(f"{line}\n".encode())
         if self._board:
             for name, value in finite.items():
                 self._board.add_scalar(f"{kind}/{name}", value, step)
@@ -98,13 +109,61 @@ def open_board(logger: str, folder: Path, step: int, config: Mapping[str, Any]) 
         return None
     try:
         if logger == "tensorboard":
-            from torch.utils.tensorboard import SummaryWriter
-
-            return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
+            return _TensorBoard(folder / TENSORBOARD, step)
         return _Wandb(folder, config)
     except ImportError as error:
         remedy = f"say --logger none, or run: {pip_install(logger)}"
         raise RequestError(f"{logger} is not installed; {remedy}") from error
+
+
+class _TensorBoard:
+    """File of events for TensorBoard, made when the first number is added.
+
+    TensorBoard's own writer has a thread, which a full disk ends with a traceback.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        import tensorboard.summary.writer.record_writer  # noqa: F401 — not installed: found out now
+
+        self._folder, self._step = folder, step
+        self._file: AppendFile | None = None
+
+    def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
+        """Add a number."""
+        import tensorboard.compat.proto.event_pb2 as made_by_protobuf
+
+        events: Any = made_by_protobuf
+        if self._file is None:
+            with disk_errors(self._folder):
+                self._folder.mkdir(parents=True, exist_ok=True)
+            self._file = AppendFile(self._folder / _event_file_name())
+            self._append(events.Event(wall_time=time.time(), file_version="brain.Event:2"))
+            if self._step:  # hides what an interrupted process has written of later steps
+                log = events.SessionLog(status=events.SessionLog.START)
+                self._append(
+                    events.Event(wall_time=time.time(), step=self._step + 1, session_log=log)
+                )
+        event = events.Event(wall_time=time.time(), step=global_step)
+        event.summary.value.add(tag=tag, simple_value=scalar_value)
+        self._append(event)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+    def _append(self, event: Any) -> None:
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        assert self._file is not None
+        record = io.BytesIO()
+        RecordWriter(record).write(event.SerializeToString())
+        self._file.append(record.getvalue())
+
+
+def _event_file_name() -> str:
+    parts = f"{time.time():017.6f}", socket.gethostname(), str(os.getpid())
+    return f"{EVENTS}.{'.'.join(parts)}{EVENTS_SUFFIX}"
 
 
 class _Wandb:
@@ -186,7 +245,9 @@ def write_curves(
         axes.grid(True, which="both", alpha=0.3)
         if axes.lines and validation and (place == 0 or len(names) > 1):
             axes.legend()
-    figure.suptitle(title)
+    # A name of a folder: no formula, and bytes that are no UTF-8 cannot be drawn.
+    readable = title.encode(errors="replace").decode()
+    figure.suptitle(readable, parse_math=False)
     with atomic_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120)
     return True

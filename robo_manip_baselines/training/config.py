@@ -25,8 +25,9 @@ from robo_manip_baselines.policy.presets import (
     with_tuples,
 )
 from robo_manip_baselines.policy.registry import policy_presets
+from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import write_text
+from robo_manip_baselines.runs.files import FolderKind, write_text
 
 Network = TypeVar("Network")
 
@@ -202,8 +203,26 @@ def read_config(path: Path) -> dict[str, Any]:
 
 def write_config(run: Path, config: TrainConfig[Any]) -> None:
     """Write the options of a run, except its folder, so that ``--config`` reads them."""
+    write_text(run / CONFIG, _to_yaml(config))
+
+
+def _to_yaml(config: TrainConfig[Any]) -> str:
     values = {name: value for name, value in config.to_json().items() if name != "out"}
-    write_text(run / CONFIG, yaml.safe_dump(values, sort_keys=False, allow_unicode=True))
+    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+
+
+def _is_run(folder: Path) -> bool:
+    """Return whether a folder has checkpoints, or options just as `write_config` writes them."""
+    path = folder / CONFIG
+    if list_checkpoints(folder) or not path.is_file():
+        return bool(list_checkpoints(folder))
+    try:
+        return _to_yaml(TrainConfig.from_json(read_config(path))) == path.read_text("utf-8")
+    except (RequestError, TypeError, AttributeError):
+        return False
+
+
+RUN = FolderKind("run of bin/Train.py", _is_run)
 
 
 def require_same_config(

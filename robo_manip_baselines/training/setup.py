@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,13 @@ from robo_manip_baselines.policy.interface import PolicyDims, PolicyModel
 from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
 from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.metrics import MetricsLog, open_board
+from robo_manip_baselines.runs.metrics import (
+    EVENTS,
+    EVENTS_SUFFIX,
+    TENSORBOARD,
+    MetricsLog,
+    open_board,
+)
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.runs.versions import software_versions
 from robo_manip_baselines.training.batching import ExampleSampler
@@ -184,9 +189,13 @@ class TrainSetup:
         run, config = self.config.folder, self.config
         remove_partial_checkpoints(run)
         if start is None:  # an earlier run may have left something before its first checkpoint
+            if (run / CONFIG).is_file():
+                require_same_config(run, config)
+            else:
+                write_config(run, config)
             (run / METRICS).unlink(missing_ok=True)
-            shutil.rmtree(run / "tensorboard", ignore_errors=True)
-            write_config(run, config)
+            for path in (run / TENSORBOARD).glob(f"{EVENTS}.*{EVENTS_SUFFIX}"):
+                path.unlink()
         elif not (run / CONFIG).is_file():
             raise RequestError(f"'{run}' has lost its {CONFIG}; choose another --out")
         elif TrainConfig.from_json(read_config(run / CONFIG)).training != config.training:

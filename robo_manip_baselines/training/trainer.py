@@ -20,13 +20,13 @@ from robo_manip_baselines.runs.checkpoints import prune_checkpoints, step_folder
 from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import pip_install
-from robo_manip_baselines.runs.files import locked
+from robo_manip_baselines.runs.files import locked, require_out_folder
 from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise
-from robo_manip_baselines.training.config import CURVES, METRICS, TrainConfig
+from robo_manip_baselines.training.config import CURVES, METRICS, RUN, TrainConfig
 from robo_manip_baselines.training.device import (
     Processes,
     StepTimer,
@@ -80,6 +80,8 @@ def train(config: TrainConfig[Any], *, resume: bool = False) -> int:
 def _train(
     config: TrainConfig[Any], resume: bool, device: torch.device, processes: Processes
 ) -> int:
+    if processes.is_main:
+        require_out_folder(config.folder, RUN, [config.demonstrations])
     setup = TrainSetup.load(config)
     with contextlib.ExitStack() as stack:
         if processes.is_main:

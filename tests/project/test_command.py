@@ -62,6 +62,8 @@ def test_underscores_and_hyphens(spelling: str, sign: str) -> None:
         ("A --ratio half", ["--ratio is a number, not 'half'"]),
         ("A --num_episodes", ["--num_episodes needs a value"]),
         ("A --image_codec gif", ["--image_codec", "'jpeg', 'png', 'raw'", "not 'gif'"]),
+        ("A --out=", ["--out '': is empty"]),
+        ("A --out= --ratio 1", ["--out '': is empty", "a variable of the shell"]),
         ("A --num_episodes -3", ["num_episodes is 0 or more, not -3; xxxx"]),
     ],
 )
@@ -77,6 +79,14 @@ def test_wrong_options_are_one_line(
     assert not set("│╭╰─\x1b") & set(message)
     output = capsys.readouterr()
     assert (output.out, output.err) == ("", "")
+
+
+@pytest.mark.parametrize("args", [["A", "--out", ""], ["A", "--out", " "], ["A", "--out= "]])
+def test_empty_values_are_refused_by_name(args: list[str]) -> None:
+    with pytest.raises(RequestError, match=r"^--out '': is empty; give a value"):
+        parse(Options, EXAMPLE, args=args)
+    with pytest.raises(RequestError, match=r"^an argument '': is empty"):
+        parse(Options, EXAMPLE, args=["", "--out", "a"])
 
 
 def test_message_of_the_options_comes_through_unbroken() -> None:
@@ -163,7 +173,8 @@ def test_other_failures_keep_their_traceback() -> None:
     assert "ValueError: a bug" in done.stderr
 
 
-def test_signal_from_the_terminal() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_end_a_command(number: signal.Signals) -> None:
     code = (
         "import time\nfrom robo_manip_baselines.runs.command import run_command\n"
         "def main():\n    print('ready', flush=True)\n    time.sleep(60)\nrun_command(main)\n"
@@ -174,9 +185,58 @@ def test_signal_from_the_terminal() -> None:
         assert process.stdout is not None
         assert process.stderr is not None
         process.stdout.readline()
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert process.wait(30) == 130
         assert process.stderr.read() == "interrupted\n"
+
+
+def test_nohup_outlives_the_terminal() -> None:
+    body = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)"
+    code = (
+        f"import os\n{body}\nfrom robo_manip_baselines.runs.command import run_command\n"
+        "def main():\n    os.kill(os.getpid(), signal.SIGHUP)\n    print('lives')\n"
+        "run_command(main)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"lives\n", b"")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "text", "expected"),
+    [
+        ("ascii", "0.5 ± 0.1 × 2 – a…b ü 顔 │", b"0.5 +- 0.1 x 2 - a...b u ? |\n"),
+        ("latin-1", "± – ü", b"\xb1 - \xfc\n"),
+        ("ascii", "caf\udce9", b"caf\xe9\n"),
+        ("utf-8", "± caf\udce9", b"\xc2\xb1 caf\xe9\n"),
+    ],
+)
+def test_every_terminal_can_show_every_text(encoding: str, text: str, expected: bytes) -> None:
+    code = (
+        "import sys\nfrom robo_manip_baselines.runs.command import run_command\n"
+        f"def main():\n    print({text!a})\n    print({text!a}, file=sys.stderr)\n"
+        "run_command(main)\n"
+    )
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "LC_ALL": "C"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, env=environment, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, expected, expected)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="has no /dev/full")
+@pytest.mark.parametrize(
+    ("shell", "code", "message"),
+    [
+        ("> /dev/full", 1, "error: cannot write the output: No space left on device\n"),
+        (">&-", 0, ""),
+        ("2>&- >&-", 0, ""),
+        ("2>&1 | true", 1, ""),
+    ],
+)
+@pytest.mark.parametrize("arguments", ["--help", "train --help"])
+def test_output_that_nobody_takes(arguments: str, shell: str, code: int, message: str) -> None:
+    line = f"set -o pipefail; {sys.executable} -m face_prediction {arguments} {shell}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (code, message)
 
 
 @pytest.mark.parametrize("lines", [1, 100_000])

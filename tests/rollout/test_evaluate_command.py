@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from robo_manip_baselines.rollout.evaluation import (
 )
 from robo_manip_baselines.rollout.results import read_results
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import locked
 
 pytestmark = pytest.mark.long
 
@@ -365,3 +367,59 @@ def test_names() -> None:
     assert noisy.name == "current_pred_h3_uniform"
     assert run_name(Path("runs/act_current")) == "act_current"
     assert run_name(Path("runs/x/checkpoints/step_00000005")) == "x_step_00000005"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("--execute 7", "n_action_steps 7: must be 1 to 6"),
+        ("--device cuda:99", "device"),
+        ("--motion_library absent.npz", "absent"),
+        ("--clips absent", "absent"),
+    ],
+)
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_refused_request_leaves_the_folder_as_it_was(
+    run_folder: Path, tmp_path: Path, text: str, message: str, is_there: bool
+) -> None:
+    out = tmp_path / "new" / "out"
+    if is_there:
+        out.mkdir(parents=True)
+    with pytest.raises(RequestError, match=message):
+        evaluate(config(run_folder, text, out))
+    assert list(tmp_path.rglob("*")) == ([out.parent, out] if is_there else [])
+
+
+@pytest.mark.parametrize("name", ["summary.json", "results.jsonl", "evaluation.json", "notes.txt"])
+def test_files_of_others_stay(run_folder: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text('{"mine": 1}')
+    with pytest.raises(RequestError, match=r"another --out|another folder"):
+        evaluate(config(run_folder, out=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == '{"mine": 1}'
+
+
+def test_a_summary_of_somebody_else_stays(run_folder: Path, tmp_path: Path) -> None:
+    evaluate(config(run_folder, "--num_episodes 1", tmp_path))
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(RequestError, match="in the way of --out"):
+        evaluate(config(run_folder, out=tmp_path))
+    assert (tmp_path / "summary.json").read_text() == "{}"
+    assert len(read_results(tmp_path)) == 1
+
+
+def test_one_folder_has_one_writer(run_folder: Path, tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(RequestError, match="by another process"):
+        evaluate(config(run_folder, out=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_a_path_that_is_no_text_is_kept(run_folder: Path, tmp_path: Path) -> None:
+    run, out = (tmp_path / os.fsdecode(name) for name in (b"caf\xe9", b"r\xe9sultats"))
+    shutil.copytree(run_folder, run)
+    evaluate(config(run, "--num_episodes 1", out))
+    text = (out / "evaluation.json").read_text(encoding="utf-8")
+    folder = Path(json.loads(text)["checkpoint_folder"])
+    assert folder.parent.parent == run
+    assert len(read_results(out)) == 1
+    evaluate(config(run, "--num_episodes 1", out))
