@@ -20,13 +20,14 @@ from face_prediction.motion.surface import facing_out, measure, mediapipe_topolo
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import FileKind, require_out_file
-from robo_manip_baselines.runs.npz import read_npz, write_npz
+from robo_manip_baselines.runs.npz import FileType, read_npz, write_npz
 
 logger = logging.getLogger(__name__)
 
 SCHEMA, VERSION = "face_surface", 1
 
-_SURFACE = FileKind("face surface", lambda path: read_npz(path, SCHEMA, VERSION))
+_FILE = FileType(SCHEMA, VERSION, {}, has_others=True)
+_SURFACE = FileKind("face surface", lambda path: read_npz(path, _FILE))
 
 _CHIN = 152
 _METHOD = (

@@ -48,11 +48,6 @@ def item_versions() -> dict[str, str]:
     return software_versions("h5py", "mujoco", "numpy", "robo_manip_baselines", "torch")
 
 
-@cache
-def _digest(path: Path) -> str:
-    return file_digest(path)
-
-
 @dataclass(frozen=True, eq=False)
 class WorkItem:
     """Part of a benchmark that one process does.
@@ -92,7 +87,7 @@ class WorkItem:
             "function": self.function,
             "settings": dict(self.settings),
             "needs": sorted(need.key for need in self.needs),
-            "inputs": {name: _digest(path) for name, path in self.files.items()},
+            "inputs": {name: file_digest(path) for name, path in self.files.items()},
             "threads": self.threads,
             "versions": item_versions(),
         }

@@ -33,7 +33,7 @@ from robo_manip_baselines.data.files import seed_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import locked
+from robo_manip_baselines.runs.files import file_digest, locked
 from robo_manip_baselines.runs.versions import source_digest
 
 LIBRARY = "motion_library.npz"
@@ -156,6 +156,9 @@ def main() -> int:
     threading.Thread(target=_end_with_stdin, daemon=True).start()
     _require_same_software(request)
     folder = Path.cwd()
+    for name, digest in request["inputs"].items():
+        if file_digest(folder / name) != digest:
+            raise RequestError(f"{name} was changed since the benchmark began; start it again")
     with locked(folder, wait=True):
         if read_manifest(folder, request["key"]):
             return 0

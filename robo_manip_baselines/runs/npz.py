@@ -83,6 +83,7 @@ class FileType:
         arrays: name -> type, beside ``schema`` and ``version``, in the order of the file.
         limits: name of a shared size -> largest size.
         quaternion_tolerance: of the length of quaternions.
+        has_others: whether there may be further arrays, which are not read.
     """
 
     schema: str
@@ -90,6 +91,7 @@ class FileType:
     arrays: Mapping[str, ArrayType]
     limits: Mapping[str, int] = field(default_factory=dict)
     quaternion_tolerance: float = 1e-5
+    has_others: bool = False
 
 
 @dataclass(frozen=True)
@@ -266,7 +268,7 @@ def _problem(archive: zipfile.ZipFile, members: dict[str, _Member], kind: FileTy
     if (version := _text(archive, members.get("version"))) != str(kind.version):
         return f"version {version} of '{kind.schema}', this program reads {kind.version}"
     for info in archive.infolist():
-        if info.filename.removesuffix(".npy") not in members:
+        if not kind.has_others and info.filename.removesuffix(".npy") not in members:
             return f"unknown array {info.filename[:80]!a}; a '{kind.schema}' file has none"
     sizes: dict[str, int] = {}
     for name, wanted in kind.arrays.items():

@@ -24,6 +24,7 @@ from robo_manip_baselines.data.schema import (
     stored_text,
 )
 from robo_manip_baselines.data.verify import verify_dataset, verify_file
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.tasks.registry import ENV_ARGUMENTS, task_entry
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError
@@ -346,3 +347,21 @@ def test_places_of_images_are_checked(
     assert message in problem_of(path)
     with pytest.raises(RequestError, match=message), EpisodeReader(path) as episode:
         episode.frame("top", 0)
+
+
+def test_episodes_of_one_library_belong_together_whatever_its_path(tmp_path: Path) -> None:
+    def record(seed: int, **kwargs: Any) -> None:
+        given = make_attributes(seed) | {"env_kwargs": kwargs}
+        write_episode(episode_path(tmp_path, seed, True), make_arrays(seed=seed), {}, given)
+
+    one, other = "1" * 64, "2" * 64
+    record(0, motion_library="/a.npz", motion_sha256=one)
+    record(1, motion_library="/b.npz", motion_sha256=one)
+    assert load_demonstrations(tmp_path, SPEC).env_kwargs["motion_sha256"] == one
+    assert verify_dataset(tmp_path) == []
+    record(1, motion_library="/a.npz", motion_sha256=other)
+    with pytest.raises(RequestError, match=r'env_kwargs \{"motion_sha256": "222'):
+        load_demonstrations(tmp_path, SPEC)
+    record(0)
+    record(1, motion_library="/a.npz", motion_sha256=MotionLibrary.load().sha256)
+    assert load_demonstrations(tmp_path, SPEC).seeds == (0, 1)

@@ -15,9 +15,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from robo_manip_baselines.commands.rollout import main, parse_options, to_evaluation
+from robo_manip_baselines.envs.mujoco.face.motion import (
+    DEFAULT_LIBRARY,
+    LIBRARY_FILE,
+    MotionLibrary,
+    pin_library,
+    read_library,
+)
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import Checkpoint
@@ -32,6 +40,7 @@ from robo_manip_baselines.rollout.evaluation import (
 from robo_manip_baselines.rollout.results import read_results
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import locked
+from robo_manip_baselines.runs.npz import write_npz
 
 pytestmark = pytest.mark.long
 
@@ -95,6 +104,41 @@ def test_the_summary_is_of_the_whole_folder(run_folder: Path, tmp_path: Path) ->
     assert summary["first_seed"] == 1000
     assert summary["failed_seeds"] == [1000, 1002, 1003]
     assert summary["episodes_per_second"] == pytest.approx(1 / summary["seconds"])
+
+
+def copied_library(path: Path, scale: float = 1.0) -> Path:
+    """Write the shipped motion library with mouth positions scaled."""
+    kind = {"schema": np.array(LIBRARY_FILE.schema), "version": np.array(LIBRARY_FILE.version)}
+    arrays = read_library(DEFAULT_LIBRARY)
+    write_npz(path, {**kind, **arrays, "mouth": arrays["mouth"] * np.float32(scale)})
+    return path
+
+
+def test_a_motion_library_is_known_by_its_content(
+    make_checkpoint: MakeCheckpoint, run_folder: Path, tmp_path: Path
+) -> None:
+    shipped, moved = tmp_path / "shipped", tmp_path / "moved"
+    one = "--num_episodes 1 --num_envs 1"
+    evaluate(config(run_folder, one, out=shipped))
+    # The same motion in another file is the same motion; other motion in the same file is not.
+    library = copied_library(tmp_path / "a.npz")
+    evaluate(config(run_folder, f"{one} --motion_library {library}", out=shipped))
+    copied_library(library, 1.01)
+    with pytest.raises(RequestError, match="holds results with env_kwargs"):
+        evaluate(config(run_folder, f"{one} --motion_library {library}", out=shipped))
+    evaluate(config(run_folder, f"{one} --motion_library {library}", out=moved))
+    rows = [(read_results(folder)[0].settings or {})["motion"] for folder in (shipped, moved)]
+    assert rows == [MotionLibrary.load().motion_sha256, MotionLibrary.load(library).motion_sha256]
+    assert rows[0] != rows[1]
+    # A policy goes on with the library of its demonstrations, and with no other in its place.
+    kwargs = pin_library({"max_episode_steps": 30, "motion_library": str(library)})
+    run = tmp_path / "run"
+    make_checkpoint(run / "checkpoints" / "step_00000005", dataset={"env_kwargs": kwargs})
+    EvaluationPlan.of(config(run, one))
+    copied_library(library, 1.02)
+    with pytest.raises(RequestError, match="holds other motion than what was used before"):
+        EvaluationPlan.of(config(run, one))
+    EvaluationPlan.of(config(run, f"{one} --motion_library {library}"))
 
 
 def test_results_of_another_execution_are_not_mixed(run_folder: Path, tmp_path: Path) -> None:
