@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,10 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         VideoReader(text)
     empty = tmp_path / "empty.mp4"
     empty.touch()
+    pipe = tmp_path / "pipe.mp4"
+    os.mkfifo(pipe)
     for path, message in (
+        (pipe, "is a pipe or device"),
         (tmp_path, "is a folder"),
         (empty, "is empty"),
         (tmp_path / "absent.mp4", "no such file"),
@@ -47,6 +51,13 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         with pytest.raises(RequestError, match=message) as caught:
             require_video(path)
         assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [b"talk: 1.mp4", b"caf\xe9.mp4", b"100%03d.mp4", b"-i.mp4"])
+def test_any_name_of_a_file(tmp_path: Path, write_video, monkeypatch, name: bytes) -> None:
+    write_video(tmp_path / "v.mp4", [corner()] * 3).rename(tmp_path / os.fsdecode(name))
+    monkeypatch.chdir(tmp_path)
+    assert len(read(Path(os.fsdecode(name)))) == 3
 
 
 def test_hash_of_a_file(tmp_path: Path) -> None:
