@@ -101,7 +101,7 @@ class VideoReader:
             raise self._wrong(f"truncated: {missing} of its {size + missing} bytes are missing")
         try:
             # absolute, because FFmpeg takes what is before a colon for a protocol
-            self._container = av.open(str(path.absolute()))
+            self._container = av.open(str(path.absolute()), metadata_errors="replace")
         except (FFmpegError, OSError) as error:
             wrong = f"cannot be opened as a video ({error.strerror}); truncated, or not a video"
             raise RequestError(f"{path}: {wrong}") from None
@@ -109,6 +109,8 @@ class VideoReader:
             stream = main_stream(self._container)
             if stream is None:
                 raise self._wrong("holds no video stream")
+            if stream.codec_context is None:
+                raise self._wrong("is in a format that FFmpeg cannot decode")
             self._stream = stream
             # with more threads FFmpeg flags damaged frames by chance: of two in a clip both, one or
             # none; and detection takes several times as long as decoding
