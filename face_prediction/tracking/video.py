@@ -58,11 +58,13 @@ class VideoFrame:
 
 
 def require_video(path: Path) -> None:
-    """Raise RequestError if ``path`` is absent, a folder, empty or unreadable."""
+    """Raise RequestError if ``path`` is absent, no regular file, empty or unreadable."""
     if path.is_dir():
         raise RequestError(f"{path}: is a folder; name video files")
     if not path.exists():
         raise RequestError(f"{path}: no such file")
+    if not path.is_file():
+        raise RequestError(f"{path}: is a pipe or device; name video files")
     try:
         with path.open("rb") as stream:
             empty = not stream.read(1)
@@ -98,7 +100,8 @@ class VideoReader:
             size = path.stat().st_size
             raise self._wrong(f"truncated: {missing} of its {size + missing} bytes are missing")
         try:
-            self._container = av.open(str(path))
+            # absolute, because FFmpeg takes what is before a colon for a protocol
+            self._container = av.open(str(path.absolute()), metadata_errors="replace")
         except (FFmpegError, OSError) as error:
             wrong = f"cannot be opened as a video ({error.strerror}); truncated, or not a video"
             raise RequestError(f"{path}: {wrong}") from None
@@ -106,6 +109,8 @@ class VideoReader:
             stream = main_stream(self._container)
             if stream is None:
                 raise self._wrong("holds no video stream")
+            if stream.codec_context is None:
+                raise self._wrong("is in a format that FFmpeg cannot decode")
             self._stream = stream
             # with more threads FFmpeg flags damaged frames by chance: of two in a clip both, one or
             # none; and detection takes several times as long as decoding

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from face_prediction.motion.attribution import find_row, read_attributions
@@ -110,6 +110,7 @@ def test_a_row_is_of_one_clip(tmp_path: Path, row: str, clip: str, is_found: boo
         assert found.clip == clip
 
 
+@settings(max_examples=50)
 @given(st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), min_size=1))
 def test_any_name_finds_its_own_row(tmp_path_factory, name: str) -> None:
     """A name that is no path and has no video's suffix licenses the clip of that name only."""
@@ -120,6 +121,19 @@ def test_any_name_finds_its_own_row(tmp_path_factory, name: str) -> None:
     quoted = name.replace('"', '""')
     path.write_text(f'{HEAD}"{quoted}",ann,yes,MIT,x\n', encoding="utf-8", newline="")
     assert list(read_attributions(path)) == [name]
+
+
+@settings(max_examples=50)
+@given(st.binary(), st.sampled_from(["t.csv", "t.md"]))
+def test_any_bytes_are_a_table_or_one_line(tmp_path_factory, content: bytes, name: str) -> None:
+    path = tmp_path_factory.getbasetemp() / name
+    path.write_bytes(HEAD.encode() + content)
+    problem = "none"
+    try:
+        read_attributions(path)
+    except RequestError as error:
+        problem = str(error)
+    assert len(problem.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

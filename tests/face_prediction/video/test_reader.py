@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,10 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         VideoReader(text)
     empty = tmp_path / "empty.mp4"
     empty.touch()
+    pipe = tmp_path / "pipe.mp4"
+    os.mkfifo(pipe)
     for path, message in (
+        (pipe, "is a pipe or device"),
         (tmp_path, "is a folder"),
         (empty, "is empty"),
         (tmp_path / "absent.mp4", "no such file"),
@@ -47,6 +51,39 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         with pytest.raises(RequestError, match=message) as caught:
             require_video(path)
         assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [b"talk: 1.mp4", b"caf\xe9.mp4", b"100%03d.mp4", b"-i.mp4"])
+def test_any_name_of_a_file(tmp_path: Path, write_video, monkeypatch, name: bytes) -> None:
+    write_video(tmp_path / "v.mp4", [corner()] * 3).rename(tmp_path / os.fsdecode(name))
+    monkeypatch.chdir(tmp_path)
+    assert len(read(Path(os.fsdecode(name)))) == 3
+
+
+def test_any_damage_gives_frames_or_one_line(tmp_path: Path, write_video) -> None:
+    """Bytes anywhere, headers and texts among them: no other error, and no line break."""
+    random = np.random.default_rng(0)
+    problems: list[str] = []
+    for suffix in ("mp4", "mkv", "avi"):
+        path = write_video(tmp_path / f"v.{suffix}", [corner()] * 6)
+        whole = path.read_bytes()
+        for _ in range(40):
+            data = bytearray(whole)
+            for place in random.integers(0, len(data), random.integers(1, 9)):
+                data[place] = random.integers(256)
+            path.write_bytes(data)
+            try:
+                read(path)
+            except RequestError as error:
+                problems.append(str(error))
+    assert problems
+    assert all(str(tmp_path) in problem and "\n" not in problem for problem in problems)
+
+
+def test_texts_that_are_not_utf8(tmp_path: Path, write_video) -> None:
+    path = write_video(tmp_path / "v.mkv", [corner()] * 3)
+    path.write_bytes(path.read_bytes().replace(b"ENCODER", b"ENC\xd6DER"))
+    assert len(read(path)) == 3
 
 
 def test_hash_of_a_file(tmp_path: Path) -> None:
