@@ -20,7 +20,7 @@ from robo_manip_baselines.runs import threads
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import read_metrics
-from robo_manip_baselines.training.config import TrainConfig
+from robo_manip_baselines.training.config import TrainConfig, write_config
 from robo_manip_baselines.training.requirements import prepare_pytorch
 from robo_manip_baselines.training.trainer import train as train_config
 
@@ -66,7 +66,7 @@ def weights(run: Path) -> bytes:
     return (read_checkpoint(run).folder / "model.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_saves_and_names_the_next_command(
     number: signal.Signals, line: str, repository: Path, tmp_path: Path
 ) -> None:
@@ -353,3 +353,45 @@ def test_a_run_from_python_is_that_of_the_command(episodes: Path, tmp_path: Path
     assert train_config(config, resume=True) == 0
     assert weights(tmp_path / "built") == weights(tmp_path / "typed")
     assert losses(tmp_path / "built") == losses(tmp_path / "typed")
+
+
+def test_a_folder_of_somebody_else_stays(line: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    (run / "tensorboard" / "other").mkdir(parents=True)
+    (run / "tensorboard" / "other" / "events.out.tfevents.1").write_text("theirs")
+    (run / "config.yaml").write_text("# why\nsteps: 2\n")
+    with pytest.raises(RequestError, match=r"config\.yaml, tensorboard and no run of"):
+        train(f"Mlp {line} --config {run / 'config.yaml'}".split())
+    assert (run / "config.yaml").read_text() == "# why\nsteps: 2\n"
+    assert sorted(path.name for path in run.rglob("*")) == [
+        *("config.yaml", "events.out.tfevents.1", "other", "tensorboard"),
+    ]
+
+
+def test_a_run_that_was_stopped_early_begins_again_beside_the_logs_of_others(
+    line: str, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    words = f"Mlp {line} --steps 5 --logger tensorboard".split()
+    write_config(run, parse_config(words))  # as a run leaves it that is killed at its first step
+    theirs, ours = (run / "tensorboard" / f"events.out.tfevents.1{x}" for x in ("", ".run"))
+    theirs.parent.mkdir()
+    theirs.write_text("theirs")
+    ours.write_text("ours")
+    with pytest.raises(RequestError, match="holds a run with steps 5, not 6"):
+        train([*words, "--steps", "6"])
+    assert ours.exists()
+    train(words)
+    assert theirs.read_text() == "theirs"
+    assert not ours.exists()
+
+
+def test_demonstrations_and_run_at_paths_that_are_no_text(
+    line: str, episodes: Path, tmp_path: Path
+) -> None:
+    dataset, run = (tmp_path / os.fsdecode(name) for name in (b"caf\xe9", b"m\xe9thode"))
+    dataset.symlink_to(episodes)
+    words = f"Mlp {TINY} --steps 5 --dataset".split()
+    train([*words, str(dataset), "--out", str(run)])
+    assert read_checkpoint(run).dataset["folder"] == str(dataset)
+    train(["Mlp", "--out", str(run), "--resume"])
