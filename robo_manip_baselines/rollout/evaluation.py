@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model, read_checkpoint
@@ -156,6 +157,8 @@ class EvaluationPlan:
         if config.corruption is not None:
             spec = replace(spec, corruption=config.corruption.pinned())
         recorded = checkpoint.dataset.get("env_kwargs", {})
+        if "motion" in config.env_kwargs and not parse_motion(config.env_kwargs["motion"]).recorded:
+            recorded = {name: value for name, value in recorded.items() if name != "clips"}
         env = EnvConfig(checkpoint.env, spec, {**recorded, **config.env_kwargs})
         _require_fit(checkpoint, env)
         if (spec.cameras or config.videos) and (problem := opengl_problem()):

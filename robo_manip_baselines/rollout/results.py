@@ -24,8 +24,9 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import prepare_folder, read_json, write_json, write_text
 from robo_manip_baselines.runs.progress import closing_table
 
-ROW_VERSION = 2
-"""of a row; version 1 named the condition ``arm`` and did not hold the observation spec."""
+ROW_VERSION = 3
+"""of a row; version 2 did not hold the motion, which was ``recorded``; version 1 named the condition
+``arm`` and did not hold the observation spec either."""
 
 SCHEMA = "robo_manip_baselines/evaluation"
 SCHEMA_VERSION = 1
@@ -50,8 +51,9 @@ class EpisodeResult:
         completion_time: s to success, as the task counts it; null without success
         steps: control steps of 0.02 s
         failure: kind of failure; empty for a success
-        motion_clip: recorded clip whose motion the face replayed
-        motion_subject: person in that clip
+        motion_clip: recorded clip whose motion the face replayed; synthetic without one
+        motion_subject: person in that clip, likewise
+        motion: of the face by name, see `parse_motion`
         columns: columns of the task, see its entry
         policy: name of the policy
         condition: name of the experimental condition, for example current_pred_h2
@@ -70,6 +72,7 @@ class EpisodeResult:
     failure: str
     motion_clip: str
     motion_subject: str
+    motion: str = "recorded"
     columns: dict[str, Any] = field(default_factory=dict)
     policy: str = ""
     condition: str = ""
@@ -99,8 +102,10 @@ class EpisodeResult:
             values.setdefault("observation", None)
             if "arm" in values:
                 values["condition"] = values.pop("arm")
-        elif version != ROW_VERSION:
-            raise ValueError(f"'version' is {version}; this release reads 1 and {ROW_VERSION}")
+        elif version not in (2, ROW_VERSION):
+            raise ValueError(f"'version' is {version}; this release reads 1 to {ROW_VERSION}")
+        if version in (1, 2):
+            values.setdefault("motion", "recorded")
         hints = typing.get_type_hints(cls)
         hints.pop("columns")
         given = {name: _checked(values, name, hint) for name, hint in hints.items()}
