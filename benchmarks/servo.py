@@ -1,8 +1,8 @@
 """Value of foresight to a visual servo: motion, delay, lead and forecast, on common seeds.
 
-The scripted servo feeds a face that moves; it sees the mouth some frames late, and aims a lead ahead
-of the newest one seen. Episodes are appended to a file as they end. The same command continues from
-there, and prints the table of all episodes in it.
+The scripted servo feeds a face that moves; it sees the mouth some frames late, and aims a lead
+ahead of the newest one seen. Episodes are appended to a file as they end. The same command
+continues from there, and prints the table of all episodes in it.
 
 Example: python benchmarks/servo.py --num_episodes 50 --workers 2 --out servo.jsonl
 """

@@ -100,8 +100,8 @@ class RolloutOptions:
         out: Folder to write to; if not given, dataset/<env> or results/<env>_<run>.
         face_motion: Start of the face's motion: with the episode, or after_lift. If not given,
             episode, or as in the demonstrations of the policy.
-        motion: Motion of the face: recorded, sway, ..., with parameters sway:amplitude=0.03, or a sum
-            recorded+tremor. If not given, recorded, or as in the demonstrations.
+        motion: Motion of the face: recorded, sway, ..., with parameters sway:amplitude=0.03, or a
+            sum recorded+tremor. If not given, recorded, or as in the demonstrations.
         clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
         motion_library: File of recorded face motion; if not given, the one that ships with the
             package, or that of the demonstrations.

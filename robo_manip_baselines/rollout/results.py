@@ -25,8 +25,8 @@ from robo_manip_baselines.runs.files import prepare_folder, read_json, write_jso
 from robo_manip_baselines.runs.progress import closing_table
 
 ROW_VERSION = 3
-"""of a row; version 2 did not hold the motion, which was ``recorded``; version 1 named the condition
-``arm`` and did not hold the observation spec either."""
+"""of a row; version 2 did not hold the motion, which was ``recorded``; version 1 did not hold the
+observation spec either, and named the condition ``arm``."""
 
 SCHEMA = "robo_manip_baselines/evaluation"
 SCHEMA_VERSION = 1

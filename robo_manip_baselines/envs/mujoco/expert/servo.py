@@ -1,13 +1,12 @@
 """Visual servo: phases that follow a moving target as it is seen, late and with a lead.
 
-The servo sees the target ``delay`` after it was there, and aims where a forecast made from that says
-that it will be ``lead`` later. With the true future and no delay, a lead of the arm's own lag makes
-the gripper follow without error.
+The servo sees the target some frames late, and aims where a forecast says that it will be some
+frames after the newest one seen. With the true future, the best lead is the delay plus the lag of
+the arm itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 

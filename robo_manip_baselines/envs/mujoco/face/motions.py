@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from robo_manip_baselines.envs.mujoco.face.synthetic import (
     REACH,
     Chew,
     Dyskinetic,
+    Limits,
     MotionPart,
     Nod,
     Spasm,
@@ -37,7 +38,6 @@ from robo_manip_baselines.envs.mujoco.face.synthetic import (
     Tremor,
     Turn,
     TurnAway,
-    parameter,
 )
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.seeds import stream_generator
@@ -69,7 +69,7 @@ class Recorded(MotionPart):
     """
 
     name: ClassVar[str] = "recorded"
-    speed: float = parameter(1.0, "", 1.0, 4.0)
+    speed: Annotated[float, Limits(1.0, 4.0)] = 1.0
 
     def draw(
         self, rng: np.random.Generator, library: MotionLibrary, clips: Sequence[str] | None
@@ -99,7 +99,7 @@ def replay_faster(library: MotionLibrary, segment: MotionSegment, speed: float) 
     step = np.linalg.norm(np.diff(mouth, axis=0), axis=1)
     margin = round(TURNING_POINT * library.fps)
     low, high = int(np.argmin(step[:margin])), len(step) - int(np.argmin(step[: -margin - 1 : -1]))
-    frames = segment.start + speed * np.arange(_frame_count(library.fps))
+    frames = segment.start + speed * np.arange(_frame_count(library.fps), dtype=np.float64)
     displacement, orientation, jaw = whole.at(there_and_back(frames, low, high) / library.fps)
     return replace(whole, displacement=displacement, orientation=orientation, jaw=jaw)
 
@@ -262,7 +262,7 @@ def _parse_mapping(given: Mapping[Any, Any]) -> MotionPart:
 
 def _parse_text(text: str) -> MotionPart:
     name, _, settings = text.strip().partition(":")
-    values: dict[str, Any] = {"name": name}
+    values: dict[str, Any] = {"name": name.strip()}
     for setting in settings.split(",") if settings else ():
         key, sign, value = (item.strip() for item in setting.partition("="))
         try:

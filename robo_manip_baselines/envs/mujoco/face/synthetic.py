@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,32 +50,35 @@ class Trajectory(NamedTuple):
     jaw: Floats
 
 
-def parameter(default: float | Span, unit: str, low: float, high: float) -> Any:
-    """Declare a parameter, a number or a `Span`, with its unit and limits."""
-    return field(default=default, metadata={"unit": unit, "low": low, "high": high})
+class Limits(NamedTuple):
+    """Limits of a parameter, or of both ends of a `Span`, and its unit."""
+
+    low: float
+    high: float
+    unit: str = ""
 
 
+@dataclass(frozen=True)
 class MotionPart:
-    """Base of the motions, which are frozen dataclasses of parameters from `parameter`."""
+    """Base of the motions: frozen dataclasses whose fields are annotated with `Limits`."""
 
     name: ClassVar[str]
 
     def __post_init__(self) -> None:
-        for item in fields(self):  # pyright: ignore[reportArgumentType]
-            value = self._checked(item.name, item.default, item.metadata)
+        hints = get_type_hints(type(self), include_extras=True)
+        for item in fields(self):
+            (limits,) = hints[item.name].__metadata__
+            value = self._checked(item.name, isinstance(item.default, tuple), limits)
             object.__setattr__(self, item.name, value)
 
-    def _checked(self, name: str, default: Any, metadata: Any) -> float | Span:
-        value, unit = getattr(self, name), metadata["unit"]
-        low, high = metadata["low"], metadata["high"]
-        is_span = isinstance(default, tuple)
+    def _checked(self, name: str, is_span: bool, limits: Limits) -> float | Span:
+        value, (low, high, unit) = getattr(self, name), limits
         ends = list(value) if is_span and isinstance(value, list | tuple) else [value]
         numbers = all(isinstance(e, int | float) and not isinstance(e, bool) for e in ends)
         if not (numbers and len(ends) in (1, 2) and low <= ends[0] <= ends[-1] <= high):
             kind = "a number, or two in ascending order, of" if is_span else "a number of"
-            raise RequestError(
-                f"motion '{self.name}', {name} {value}: must be {kind} {low:g} to {high:g} {unit}"
-            )
+            rule = f"must be {kind} {low:g} to {high:g} {unit}".rstrip()
+            raise RequestError(f"motion '{self.name}', {name} {value}: {rule}")
         return (float(ends[0]), float(ends[-1])) if is_span else float(ends[0])
 
     @classmethod
@@ -85,7 +88,7 @@ class MotionPart:
         Raises:
             RequestError: there is no such parameter, or a value is not valid.
         """
-        known = [item.name for item in fields(cls)]  # pyright: ignore[reportArgumentType]
+        known = [item.name for item in fields(cls)]
         for name in values:
             if not known:
                 raise RequestError(f"motion '{cls.name}' has no parameters; leave '{name}' out")
@@ -95,7 +98,7 @@ class MotionPart:
     def __str__(self) -> str:
         """Name, and the parameters that differ from the defaults: ``sway:amplitude=0.03``."""
         given = []
-        for item in fields(self):  # pyright: ignore[reportArgumentType]
+        for item in fields(self):
             value = getattr(self, item.name)
             if value != item.default:
                 ends = dict.fromkeys(value if isinstance(value, tuple) else [value])
@@ -103,6 +106,7 @@ class MotionPart:
         return self.name + (":" if given else "") + ",".join(given)
 
 
+@dataclass(frozen=True)
 class SyntheticMotion(MotionPart):
     """Base of the motions that are computed.
 
@@ -218,10 +222,10 @@ class Nod(SyntheticMotion):
     """
 
     name: ClassVar[str] = "nod"
-    angle: Span = parameter((5.0, 12.0), "deg", 0.0, 40.0)
-    frequency: Span = parameter((0.8, 1.6), "Hz", 0.1, 4.0)
-    pause: Span = parameter((0.4, 2.0), "s", 0.0, 12.0)
-    decline: float = parameter(0.7, "", 0.0, 1.0)
+    angle: Annotated[Span, Limits(0.0, 40.0, "deg")] = (5.0, 12.0)
+    frequency: Annotated[Span, Limits(0.1, 4.0, "Hz")] = (0.8, 1.6)
+    pause: Annotated[Span, Limits(0.0, 12.0, "s")] = (0.4, 2.0)
+    decline: Annotated[float, Limits(0.0, 1.0)] = 0.7
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return nods about the neck."""
@@ -249,9 +253,9 @@ class Turn(SyntheticMotion):
     """
 
     name: ClassVar[str] = "turn"
-    angle: Span = parameter((5.0, 20.0), "deg", 0.0, 45.0)
-    duration: Span = parameter((0.6, 1.2), "s", 0.1, 12.0)
-    rest: Span = parameter((0.3, 1.5), "s", 0.0, 12.0)
+    angle: Annotated[Span, Limits(0.0, 45.0, "deg")] = (5.0, 20.0)
+    duration: Annotated[Span, Limits(0.1, 12.0, "s")] = (0.6, 1.2)
+    rest: Annotated[Span, Limits(0.0, 12.0, "s")] = (0.3, 1.5)
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return turns about the neck."""
@@ -277,9 +281,9 @@ class Sway(SyntheticMotion):
     """
 
     name: ClassVar[str] = "sway"
-    frequency: Span = parameter((0.25, 0.6), "Hz", 0.01, 3.0)
-    amplitude: Span = parameter((0.020, 0.035), "m", 0.0, REACH)
-    direction: float = parameter(30.0, "deg", 0.0, 90.0)
+    frequency: Annotated[Span, Limits(0.01, 3.0, "Hz")] = (0.25, 0.6)
+    amplitude: Annotated[Span, Limits(0.0, REACH, "m")] = (0.020, 0.035)
+    direction: Annotated[float, Limits(0.0, 90.0, "deg")] = 30.0
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return one sinusoid."""
@@ -292,20 +296,20 @@ class Sway(SyntheticMotion):
 
 
 TREMOR_SLOPE, TREMOR_OFFSET = 0.47, -1.8
-"""Of log10(T / cm) = slope rating + offset, for the displacement T of a head (Elble et al. 2016)."""
+"""Of log10(T / cm) = slope rating + offset, T the displacement of a head (Elble et al. 2016)."""
 
 TREMOR_DIRECTIONS = (14, 9, 28)
 """Patients, of 51, whose head says "no-no", "yes-yes" or both (Robakis and Louis 2015)."""
 
 
 def tremor_displacement(rating: float) -> float:
-    """Return the displacement, m, from end to end, of a head tremor of a clinical rating 0 ... 4."""
+    """Return the displacement, m from end to end, of a head tremor of clinical rating 0 ... 4."""
     return 0.01 * 10.0 ** (TREMOR_SLOPE * rating + TREMOR_OFFSET)
 
 
 @dataclass(frozen=True)
 class Tremor(SyntheticMotion):
-    """Tremor of the head, turning, nodding or both: a control, too fast for an arm to follow.
+    """Tremor of the head, turned, nodded or both: a control, too fast for an arm to follow.
 
     *Amplitude.* Elble et al. 2006 (Brain 129:2660) found log10 T = alpha rating + beta for the
     tremor T, in cm, of hands, with alpha 0.27 to 0.58. For heads, Elble et al. 2016 (Mov Disord
@@ -326,8 +330,8 @@ class Tremor(SyntheticMotion):
 
     name: ClassVar[str] = "tremor"
     frame_rate: ClassVar[float] = 5 * FRAME_RATE  # lines between 30 frames/s would clip its peaks
-    rating: float = parameter(2.0, "", 0.0, 4.0)
-    frequency: Span = parameter((4.0, 11.0), "Hz", 1.0, 15.0)
+    rating: Annotated[float, Limits(0.0, 4.0)] = 2.0
+    frequency: Annotated[Span, Limits(1.0, 15.0, "Hz")] = (4.0, 11.0)
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return an oscillation whose phase and strength wander a little."""
@@ -359,9 +363,9 @@ class Dyskinetic(SyntheticMotion):
     """
 
     name: ClassVar[str] = "dyskinetic"
-    rms: float = parameter(0.015, "m", 0.0, 0.03)
-    band: Span = parameter((0.2, 1.5), "Hz", 0.01, 5.0)
-    rotation: float = parameter(3.0, "deg", 0.0, 15.0)
+    rms: Annotated[float, Limits(0.0, 0.03, "m")] = 0.015
+    band: Annotated[Span, Limits(0.01, 5.0, "Hz")] = (0.2, 1.5)
+    rotation: Annotated[float, Limits(0.0, 15.0, "deg")] = 3.0
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return noise in six dimensions."""
@@ -383,11 +387,11 @@ class Spasm(SyntheticMotion):
     """
 
     name: ClassVar[str] = "spasm"
-    amplitude: Span = parameter((0.02, 0.04), "m", 0.0, REACH)
-    angle: Span = parameter((3.0, 10.0), "deg", 0.0, 30.0)
-    rise: float = parameter(0.15, "s", 0.05, 2.0)
-    back: float = parameter(1.5, "s", 0.1, 12.0)
-    interval: Span = parameter((2.0, 6.0), "s", 0.0, 12.0)
+    amplitude: Annotated[Span, Limits(0.0, REACH, "m")] = (0.02, 0.04)
+    angle: Annotated[Span, Limits(0.0, 30.0, "deg")] = (3.0, 10.0)
+    rise: Annotated[float, Limits(0.05, 2.0, "s")] = 0.15
+    back: Annotated[float, Limits(0.1, 12.0, "s")] = 1.5
+    interval: Annotated[Span, Limits(0.0, 12.0, "s")] = (2.0, 6.0)
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return jerks."""
@@ -416,10 +420,10 @@ class TurnAway(SyntheticMotion):
     """
 
     name: ClassVar[str] = "turn_away"
-    angle: Span = parameter((35.0, 45.0), "deg", 0.0, 60.0)
-    duration: Span = parameter((0.5, 0.9), "s", 0.2, 6.0)
-    stay: Span = parameter((1.0, 2.0), "s", 0.0, 12.0)
-    interval: Span = parameter((3.0, 6.0), "s", 0.0, 12.0)
+    angle: Annotated[Span, Limits(0.0, 60.0, "deg")] = (35.0, 45.0)
+    duration: Annotated[Span, Limits(0.2, 6.0, "s")] = (0.5, 0.9)
+    stay: Annotated[Span, Limits(0.0, 12.0, "s")] = (1.0, 2.0)
+    interval: Annotated[Span, Limits(0.0, 12.0, "s")] = (3.0, 6.0)
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return refusals, each to one side."""
@@ -452,9 +456,9 @@ class Chew(SyntheticMotion):
     """
 
     name: ClassVar[str] = "chew"
-    frequency: Span = parameter((0.83, 1.67), "Hz", 0.1, 4.0)
-    opening: Span = parameter((0.008, 0.015), "m", 0.0, 0.025)
-    nod: float = parameter(1.0, "deg", 0.0, 10.0)
+    frequency: Annotated[Span, Limits(0.1, 4.0, "Hz")] = (0.83, 1.67)
+    opening: Annotated[Span, Limits(0.0, 0.025, "m")] = (0.008, 0.015)
+    nod: Annotated[float, Limits(0.0, 10.0, "deg")] = 1.0
 
     def sample(self, rng: np.random.Generator, time: Floats) -> Trajectory:
         """Return cycles of the jaw."""

@@ -137,8 +137,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 )
         if clips is not None and self.motion.recorded is None:
             raise RequestError(
-                f"clips {', '.join(clips)}: the motion '{self.motion}' has no recording; leave them "
-                "out, or add 'recorded' to the motion"
+                f"clips {', '.join(clips)}: the motion '{self.motion}' has no recording; leave "
+                "them out, or add 'recorded' to the motion"
             )
         for clip in clips or ():
             require_choice("clip", clip, set(self.library.run_clip))
