@@ -74,7 +74,8 @@ def test_a_line_gives_the_result_back(result: EpisodeResult) -> None:
         ({"failure": "bored"}, "'failure' is \"bored\""),
         ({"versions": {"numpy": 2}}, "'versions' is"),
         ({"observation": 3}, "'observation' is"),
-        ({"version": 3}, "'version' is 3; this release reads 1 and 2"),
+        ({"version": 4}, "'version' is 4; this release reads 1 to 3"),
+        ({"motion": None}, "'motion' is null"),
         ({"mood": "good"}, "'mood' is unknown"),
     ],
 )
@@ -95,9 +96,17 @@ def test_numbers_that_json_does_not_know_are_not_written() -> None:
         replace(MISS, columns={**MISS.columns, "face_force": float("nan")}).to_line()
 
 
+def test_rows_of_version_2_are_of_recorded_motion() -> None:
+    moved = replace(MISS, motion="sway:amplitude=0.03")
+    assert EpisodeResult.from_line(moved.to_line()) == moved
+    values = {**json.loads(MISS.to_line()), "version": 2}
+    del values["motion"]
+    assert EpisodeResult.from_line(json.dumps(values)) == replace(MISS, motion="recorded")
+
+
 def test_rows_of_version_1_are_read() -> None:
     values = json.loads(MISS.to_line())
-    del values["version"], values["observation"]
+    del values["version"], values["observation"], values["motion"]
     values["arm"] = values.pop("condition")
     assert EpisodeResult.from_line(json.dumps(values)) == replace(MISS, observation=None)
 
