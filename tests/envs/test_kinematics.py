@@ -105,7 +105,7 @@ def test_every_start_and_every_shipped_segment_is_within_reach() -> None:
         assert np.linalg.norm(error[3:]) < 1e-2, corner  # rad
 
 
-@pytest.mark.parametrize("corner", itertools.product((-1.0, 1.0), repeat=3))
+@pytest.mark.parametrize("corner", list(itertools.product((-1.0, 1.0), repeat=3)))
 def test_every_corner_that_a_computed_motion_may_take_the_mouth_to_is_within_reach(
     corner: tuple[float, float, float],
 ) -> None:
