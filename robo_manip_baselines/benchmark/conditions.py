@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from robo_manip_baselines.benchmark.forecasts import FORECASTS
+from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.policy.registry import policy_entry
@@ -46,6 +47,8 @@ class ConditionConfig:
         prediction: future of the target in observations: ``truth``, or a forecast in its place, see
             `forecasts`.
         expert: of the demonstrations; the task's default if empty.
+        motion: of the face in demonstrations and evaluation, as text that `parse_motion` reads; in
+            YAML a mapping or a list, too.
         title: in tables and figures; made from the observations if empty.
 
     Raises:
@@ -57,6 +60,7 @@ class ConditionConfig:
     spec: ObservationSpec = _DEFAULT_SPEC
     prediction: str = "truth"
     expert: str = ""
+    motion: str = "recorded"
     title: str = ""
 
     def __post_init__(self) -> None:
@@ -67,7 +71,16 @@ class ConditionConfig:
             )
         policy_entry(self.policy)
         require_choice("prediction", self.prediction, ("truth", *FORECASTS))
+        motion = parse_motion(self.motion)
+        object.__setattr__(self, "motion", str(motion))
         spec = self.spec
+        if not motion.is_as_recorded and (
+            self.prediction != "truth" or spec.corruption.error == "model"
+        ):
+            raise RequestError(
+                f"motion '{motion}': forecasts in place of the truth, and the error model, are of "
+                "recorded motion; leave one of them out"
+            )
         if self.prediction != "truth" and (
             spec.obs != "current_pred" or spec.corruption.error != "none"
         ):
@@ -88,6 +101,8 @@ class ConditionConfig:
         given: dict[type, dict[str, Any]] = {cls: {}, ObservationSpec: {}, Corruption: {}}
         for key, value in values.items():
             owner, name, kind = _KEYS[require_choice("key of a condition", str(key), _KEYS)]
+            if name == "motion":
+                value = str(parse_motion(value))
             accepted = (int, float) if kind is float else kind
             if not isinstance(value, accepted) or isinstance(value, bool):
                 raise RequestError(f"{key} must be {_TYPE_NAMES[kind]}, not {value!r}")
@@ -107,7 +122,7 @@ class ConditionConfig:
         """
         default, *_ = task.experts
         expert = require_choice("expert", self.expert or default, task.experts)
-        is_plain = self.prediction == "truth" and expert == default
+        is_plain = self.prediction == "truth" and expert == default and self.motion == "recorded"
         if self.name in task.load_study().published and not (
             is_plain and self.spec.name == self.name
         ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -153,10 +154,10 @@ class Plan:
     @cached_property
     def runs(self) -> tuple[PlannedRun, ...]:
         """Trainings with their evaluations, in the order of the conditions, then of the seeds."""
-        demonstrations: dict[tuple[str, str], tuple[WorkItem, ...]] = {}
+        demonstrations: dict[tuple[str, ...], tuple[WorkItem, ...]] = {}
         runs: list[PlannedRun] = []
         for condition in self.conditions:
-            variant = condition.expert, condition.prediction
+            variant = condition.expert, condition.prediction, condition.motion
             if variant not in demonstrations:
                 demonstrations[variant] = self._demonstrations(condition)
             for train_seed in range(self.preset.train_seeds):
@@ -198,6 +199,9 @@ class Plan:
             env_kwargs["motion_library"] = FORECAST
         elif self.library:
             env_kwargs["motion_library"] = LIBRARY
+        if condition.motion != "recorded":
+            variant += f"_{re.sub(r'[^a-z0-9._]+', '-', condition.motion)}"
+            env_kwargs["motion"] = condition.motion
         items = []
         for seeds in _blocks(0, self.preset.demonstrations, self.preset.demonstration_block):
             config = Collection(self.env, Path(OUT), condition.expert, seeds, env_kwargs)

@@ -102,6 +102,8 @@ class RolloutOptions:
         out: Folder to write to; if not given, dataset/<env> or results/<env>_<run>.
         face_motion: Start of the face's motion: with the episode, or after_lift. If not given,
             episode, or as in the demonstrations of the policy.
+        motion: Motion of the face: recorded, sway, ..., with parameters sway:amplitude=0.03, or a
+            sum recorded+tremor. If not given, recorded, or as in the demonstrations.
         clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
         motion_library: File of recorded face motion; if not given, the one that ships with the
             package, or that of the demonstrations.
@@ -120,6 +122,7 @@ class RolloutOptions:
     seed: int | None = None
     out: Path | None = None
     face_motion: str | None = None
+    motion: str | None = None
     clips: tuple[str, ...] = ()
     motion_library: Path | None = None
     workers: int = 2
@@ -137,9 +140,16 @@ class RolloutOptions:
 
     @property
     def motion_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about the recorded motion that were given."""
+        """Arguments of the environment about the motion that were given.
+
+        Raises:
+            RequestError: there is no such motion.
+        """
+        from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
+
         given = {
             "face_motion": self.face_motion,
+            "motion": None if self.motion is None else str(parse_motion(self.motion)),
             "clips": self.clips,
             "motion_library": self.motion_library and str(self.motion_library),
         }

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 VERSIONS = ("mujoco", "numpy", "robo_manip_baselines", "torch")
 """Software that decides how an episode goes; another Python does not."""
 
-WORLD = ("env_kwargs", "motion", "xml_hash", "device", "precision")
+WORLD = ("env_kwargs", "motion_sha256", "xml_hash", "device", "precision")
 """Settings that all conditions of a comparison share; the others may be what they differ in."""
 
 _ADVICE = "evaluate them alike, into folders of their own"
@@ -122,7 +122,12 @@ def _world(row: EpisodeResult) -> dict[str, Any]:
 
 def _condition(row: EpisodeResult) -> dict[str, Any]:
     other = {name: value for name, value in (row.settings or {}).items() if name not in WORLD}
-    names = {"condition": row.condition, "policy": row.policy, "observation": row.observation}
+    names = {
+        "condition": row.condition,
+        "policy": row.policy,
+        "observation": row.observation,
+        "motion": row.motion,
+    }
     return names | other
 
 

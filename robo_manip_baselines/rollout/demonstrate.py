@@ -112,6 +112,8 @@ def demonstrate(
     env_kwargs = dict(env.spec.kwargs)
     if env_kwargs.get("motion_library"):
         env_kwargs["motion_sha256"] = world.library.sha256
+    if "motion" in env_kwargs:
+        env_kwargs["motion"] = str(world.motion)
     attributes = {
         "env_id": env.spec.id,
         "env_kwargs": env_kwargs,

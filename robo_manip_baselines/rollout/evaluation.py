@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, pin_library
+from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import Corruption
@@ -170,6 +171,8 @@ class EvaluationPlan:
         recorded = checkpoint.dataset.get("env_kwargs", {})
         if "motion_library" in config.env_kwargs:  # another file, of other content perhaps
             recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
+        if "motion" in config.env_kwargs and not parse_motion(config.env_kwargs["motion"]).recorded:
+            recorded = {name: value for name, value in recorded.items() if name != "clips"}
         env_kwargs = pin_library({**recorded, **config.env_kwargs})
         env = EnvConfig(checkpoint.env, spec, env_kwargs)
         _require_fit(checkpoint, env)
@@ -233,7 +236,8 @@ class EvaluationPlan:
         checkpoint, spec, kwargs = self.checkpoint, self.env.spec, dict(self.env.env_kwargs)
         # A library is what it holds, wherever it lies.
         library = MotionLibrary.load(kwargs.pop("motion_library", None))
-        kwargs.pop("motion_sha256", None)
+        for name in ("motion_sha256", "motion"):
+            kwargs.pop(name, None)  # the other one is in every row
         shows_prediction = spec.corruption.error == "model"
         training = {
             "network": asdict(without_initial_weights(checkpoint.config)),
@@ -243,8 +247,8 @@ class EvaluationPlan:
         }
         settings = {
             "env_kwargs": kwargs,
-            "motion": library.motion_sha256,
-            "prediction": library.prediction_sha256 if shows_prediction else None,
+            "motion_sha256": library.motion_sha256,
+            "prediction_sha256": library.prediction_sha256 if shows_prediction else None,
             "xml_hash": checkpoint.xml_hash,
             "execution": self.settings["acting"],
             "precision": self.config.precision,

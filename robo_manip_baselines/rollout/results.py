@@ -36,8 +36,8 @@ from robo_manip_baselines.runs.files import (
 from robo_manip_baselines.runs.progress import closing_table
 
 ROW_VERSION = 3
-"""of a row; version 1 named the condition ``arm`` and did not hold the observation spec, and
-version 2 did not hold the settings of the evaluation."""
+"""of a row; version 2 held neither the settings of the evaluation nor the motion, which was
+``recorded``; version 1 did not hold the observation spec either, and named the condition ``arm``."""
 
 SCHEMA = "robo_manip_baselines/evaluation"
 SCHEMA_VERSION = 1
@@ -64,8 +64,9 @@ class EpisodeResult:
         completion_time: s to success, as the task counts it; null without success
         steps: control steps of 0.02 s
         failure: kind of failure; empty for a success
-        motion_clip: recorded clip whose motion the face replayed
-        motion_subject: person in that clip
+        motion_clip: recorded clip whose motion the face replayed; synthetic without one
+        motion_subject: person in that clip, likewise
+        motion: of the face by name, see `parse_motion`
         columns: columns of the task, see its entry
         policy: name of the policy
         condition: name of the experimental condition, for example current_pred_h2
@@ -73,8 +74,8 @@ class EpisodeResult:
         train_seed: seed of the training run; null for a policy that was not trained
         checkpoint: hash of the checkpoint's contents
         versions: of the software
-        settings: further settings that decide results: ``env_kwargs``, digests of the recorded
-            ``motion`` and, if the policy observes it, of a ``prediction``, ``xml_hash``,
+        settings: further settings that decide results: ``env_kwargs``, digests of recorded
+            motion, ``motion_sha256``, and of predictions, ``prediction_sha256``, ``xml_hash``,
             ``execution`` of action chunks, ``precision``, ``device`` and a digest of the
             ``training``; null in rows of versions 1 and 2
     """
@@ -88,6 +89,7 @@ class EpisodeResult:
     failure: str
     motion_clip: str
     motion_subject: str
+    motion: str = "recorded"
     columns: dict[str, Any] = field(default_factory=dict)
     policy: str = ""
     condition: str = ""
@@ -118,6 +120,7 @@ class EpisodeResult:
             raise ValueError(f"'version' is {version}; this release reads 1 to {ROW_VERSION}")
         if version < 3:
             values.setdefault("settings", None)
+            values.setdefault("motion", "recorded")
         if version < 2:
             values.setdefault("observation", None)
             if "arm" in values:

@@ -167,6 +167,7 @@ class LocalEnvs:
                     failure=failure,
                     motion_clip=world.segment.clip,
                     motion_subject=world.segment.subject,
+                    motion=str(world.motion),
                     columns=columns,
                 )
                 return StepResult(number, result)

@@ -99,6 +99,19 @@ def test_the_default_expert_is_the_first_of_the_task() -> None:
 
 
 @pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ("dyskinetic", "dyskinetic"),
+        ({"name": "sway", "amplitude": 0.03}, "sway:amplitude=0.03"),
+        (["recorded", "tremor"], "recorded+tremor"),
+    ],
+)
+def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> None:
+    assert condition(name="a", motion=given).motion == text
+    assert condition(name="a").motion == "recorded"
+
+
+@pytest.mark.parametrize(
     ("lines", "words"),
     [
         ("- {name: a, horizn: 3}", ["line 3", "horizn", "did you mean 'horizon'"]),
@@ -114,6 +127,11 @@ def test_the_default_expert_is_the_first_of_the_task() -> None:
         ("- {name: a, prediction: frozen}", ["line 3", "persistence, shuffled, truth"]),
         ("- {name: a, prediction: shuffled, error: uniform}", ["line 3", "without an error"]),
         ("- {name: a, prediction: shuffled, obs: current}", ["line 3", "current_pred"]),
+        ("- {name: a, motion: swai}", ["line 3", "did you mean 'sway'"]),
+        ("- {name: a, motion: {amplitude: 1}}", ["line 3", "no name", "sway"]),
+        ("- {name: a, motion: sway, prediction: shuffled}", ["line 3", "'sway'", "leave one"]),
+        ("- {name: a, motion: sway, error: model}", ["line 3", "recorded motion"]),
+        ("- {name: current, obs: current, motion: sway}", ["line 3", "of the paper"]),
         ("- {obs: current}", ["line 3", "no name"]),
         ("- {name: a b}", ["line 3", "'a b'", "letters"]),
         ("- {name: ../a}", ["line 3", "letters"]),

@@ -50,6 +50,17 @@ def test_conditions_share_demonstrations_and_nothing_else() -> None:
     assert len(keys(made, "evaluation")) == 8
 
 
+def test_a_motion_has_demonstrations_of_its_own_in_which_evaluations_act() -> None:
+    swaying = changed(name="sway", motion={"name": "sway", "amplitude": 0.03})
+    made = plan(AHEAD, swaying)
+    plain, moved = (run.training.needs[0] for run in made.runs)
+    assert "motion" not in plain.settings["config"]["env_kwargs"]
+    assert moved.settings["config"]["env_kwargs"]["motion"] == "sway:amplitude=0.03"
+    assert moved.name == "reactive_sway-amplitude-0.03_000000"
+    # The checkpoint knows the environment of its demonstrations, and evaluations take it over.
+    assert made.runs[1].evaluations[0].settings["config"]["env_kwargs"] == {}
+
+
 def test_two_conditions_that_are_the_same_but_for_the_name_are_trained_twice() -> None:
     made = plan(AHEAD, replace(AHEAD, name="again"))
     first, second = (item for item in made.items() if item.kind == "training")
@@ -91,6 +102,7 @@ def test_whatever_changes_the_outcome_changes_the_key(
         "expert": plan(changed(expert="anticipatory")),
         "forecast": plan(changed(prediction="persistence")),
         "library": plan(AHEAD, library=library),
+        "motion": plan(changed(motion="sway")),
         "policy": plan(changed(policy="Mlp")),
         "size": plan(AHEAD, preset=replace(PRESET, demonstrations=5)),
         "budget": plan(AHEAD, preset=replace(PRESET, train_settings={"steps": 7})),

@@ -31,7 +31,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "baseline": {"obs": "baseline"},
     "current": {"obs": "current"},
     "current_pred": {"obs": "current_pred", "horizon": 5},
-    "both arms": {"obs": "current_pred", "horizon": 1, "arms": "both"},
+    "both arms": {"obs": "current_pred", "horizon": 1, "arms": "both", "motion": "recorded+tremor"},
     "after lift": {"obs": "current", "face_motion": "after_lift"},
 }
 

@@ -80,7 +80,7 @@ def test_the_face_waits_for_the_lift_or_does_not(world: FeedingEnv) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("expert", sorted(ENTRY.experts))
+@pytest.mark.parametrize("expert", ["reactive", "anticipatory"])  # test_servo.py has the other
 def test_at_least_48_of_50_episodes_succeed(expert: str) -> None:
     env = make_env("FeedingEnv", cameras=())
     assert isinstance(env.unwrapped, FeedingEnv)

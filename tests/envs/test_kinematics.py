@@ -19,8 +19,9 @@ from robo_manip_baselines.envs.mujoco.expert.kinematics import (
 )
 from robo_manip_baselines.envs.mujoco.expert.phases import level_at
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
+from robo_manip_baselines.envs.mujoco.face.synthetic import REACH
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET
-from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import STANDOFF
+from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import INSERTION, STANDOFF, WITHDRAWAL
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 
 from .test_vx300s import CHAIN
@@ -102,6 +103,22 @@ def test_every_start_and_every_shipped_segment_is_within_reach() -> None:
         error = target.minus(kinematics.forward(joints))
         assert np.linalg.norm(error[:3]) < 1e-3, corner  # m, a tenth of the task's tolerance
         assert np.linalg.norm(error[3:]) < 1e-2, corner  # rad
+
+
+@pytest.mark.parametrize("corner", list(itertools.product((-1.0, 1.0), repeat=3)))
+def test_every_corner_that_a_computed_motion_may_take_the_mouth_to_is_within_reach(
+    corner: tuple[float, float, float],
+) -> None:
+    """At the lips, and in front of them where the servo starts to wait and withdraws to."""
+    kinematics, joints = ArmKinematics("right"), np.array(HOME_QPOS)
+    mouth = (FACE_OFFSET + REACH) * np.array(corner)
+    for distance in (WITHDRAWAL, INSERTION):
+        for share in np.linspace(0, 1, 8):
+            target = level(MOUTH_BASE + distance + share * mouth)
+            joints = kinematics.inverse(target, joints)
+        error = target.minus(kinematics.forward(joints))
+        assert np.linalg.norm(error[:3]) < 1e-3  # m, a tenth of the task's tolerance
+        assert np.linalg.norm(error[3:]) < 1e-2  # rad
 
 
 def level(position: np.ndarray) -> mink.SE3:

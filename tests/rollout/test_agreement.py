@@ -20,8 +20,8 @@ TASK = task_entry("FeedingEnv")
 
 SETTINGS: dict[str, Any] = {
     "env_kwargs": {"face_motion": "episode"},
-    "motion": "a" * 64,
-    "prediction": None,
+    "motion_sha256": "a" * 64,
+    "prediction_sha256": None,
     "xml_hash": "b" * 64,
     "execution": {"temporal_ensemble": False, "execute": 1},
     "precision": "fp32",
@@ -101,8 +101,10 @@ OTHER: dict[str, Mapping[str, Any]] = {
     "env_kwargs clips is None .* and ": {
         "settings": {**SETTINGS, "env_kwargs": {"face_motion": "episode", "clips": ["clip"]}}
     },
-    "motion is a{12} .* and f{12}": {"settings": {**SETTINGS, "motion": "f" * 64}},
-    "prediction is None .* and f{12}": {"settings": {**SETTINGS, "prediction": "f" * 64}},
+    "motion_sha256 is a{12} .* and f{12}": {"settings": {**SETTINGS, "motion_sha256": "f" * 64}},
+    "prediction_sha256 is None .* and f{12}": {
+        "settings": {**SETTINGS, "prediction_sha256": "f" * 64}
+    },
     "xml_hash is": {"settings": {**SETTINGS, "xml_hash": "f" * 64}},
     "execution execute is 1 .* and 10": {
         "settings": {**SETTINGS, "execution": {"temporal_ensemble": False, "execute": 10}}
@@ -146,7 +148,7 @@ def test_conditions_have_the_same_seeds() -> None:
 
 
 @pytest.mark.parametrize("message", [m for m in OTHER if m.split()[0] in {
-    "versions", "env_kwargs", "motion", "xml_hash", "precision", "device", "settings"
+    "versions", "env_kwargs", "motion_sha256", "xml_hash", "precision", "device", "settings"
 }])  # fmt: skip
 def test_conditions_share_a_world(message: str) -> None:
     rows = make_rows(conditions=["current", "baseline"])
@@ -160,7 +162,7 @@ def test_training_runs_and_conditions_may_differ_in_what_they_are_about() -> Non
     with pytest.raises(RequestError, match=r"train_seed|checkpoint"):
         as_summary([*make_rows(train_seeds=1), replace(ROW, seed=1003, train_seed=1)])
     rows = make_rows(conditions=["current", "baseline"])
-    other = {"prediction": "f" * 64, "training": "f" * 64, "execution": {"execute": 5}}
+    other = {"prediction_sha256": "f" * 64, "training": "f" * 64, "execution": {"execute": 5}}
     changes = {"policy": "Mlp", "settings": {**SETTINGS, **other}, "observation": None}
     as_statistics([replace(r, **changes) if r.condition == "baseline" else r for r in rows])
     # Another Python changes no episode.

@@ -174,6 +174,18 @@ def test_refuses_to_mix_settings(folder: Path, tmp_path: Path) -> None:
         collect(collection(out, "--face_motion", "after_lift"))
 
 
+def test_a_motion_is_recorded_with_its_episodes_and_replayed(tmp_path: Path) -> None:
+    given = ["--motion", "recorded + tremor:rating=3", "--expert", "servo", "--num_episodes", "1"]
+    collect(collection(tmp_path, *given))
+    (path,) = list_episodes(tmp_path)
+    attributes = read_metadata(path)
+    assert attributes["env_kwargs"]["motion"] == "recorded+tremor:rating=3"
+    assert attributes["motion_subject"] != "synthetic"
+    found = deviation(path)
+    assert (found.qpos, found.qvel) == (0.0, 0.0)
+    assert not verify_dataset(tmp_path)
+
+
 def test_killed_and_continued_it_ends_with_the_same_files(folder: Path, tmp_path: Path) -> None:
     """SIGKILL at several moments; what is there is always whole."""
     out = tmp_path / "killed"
@@ -209,6 +221,7 @@ def test_killed_and_continued_it_ends_with_the_same_files(folder: Path, tmp_path
         (["FeedingEnv", "--scripted", "--image_codec", "gif"], "unknown image codec 'gif'"),
         (["FeedingEnv", "--scripted", "--image_quality", "0"], "image quality 0"),
         (["FeedingEnv", "--scripted", "--face_motion", "no"], "unknown face motion 'no'"),
+        (["FeedingEnv", "--scripted", "--motion", "hop"], "unknown motion 'hop'"),
         (["FeedingEnv", "--scripted", "--motion_library", "no.npz"], "'no.npz' does not exist"),
         (["FeedingEnv", "--scripted", "--sedd", "1"], "--sedd"),
         (["FeedingEnv", "--scripted", "--obs", "current"], "--obs goes with --policy"),

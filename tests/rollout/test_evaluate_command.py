@@ -127,7 +127,9 @@ def test_a_motion_library_is_known_by_its_content(
     with pytest.raises(RequestError, match="holds results with env_kwargs"):
         evaluate(config(run_folder, f"{one} --motion_library {library}", out=shipped))
     evaluate(config(run_folder, f"{one} --motion_library {library}", out=moved))
-    rows = [(read_results(folder)[0].settings or {})["motion"] for folder in (shipped, moved)]
+    rows = [
+        (read_results(folder)[0].settings or {})["motion_sha256"] for folder in (shipped, moved)
+    ]
     assert rows == [MotionLibrary.load().motion_sha256, MotionLibrary.load(library).motion_sha256]
     assert rows[0] != rows[1]
     # A policy goes on with the library of its demonstrations, and with no other in its place.
@@ -333,7 +335,21 @@ def test_options_of_the_environment_come_from_the_demonstrations(
     assert EvaluationPlan.of(config(late)).env.env_kwargs == {"face_motion": "after_lift"}
     given = EvaluationPlan.of(config(late, "--face_motion episode"))
     assert given.env.env_kwargs == {"face_motion": "episode"}
+    moved = EvaluationPlan.of(config(late, "--motion sway:amplitude=3e-2"))
+    assert moved.env.env_kwargs == {"face_motion": "after_lift", "motion": "sway:amplitude=0.03"}
     assert config(run_folder).seeds == range(1000, 1003)
+
+
+def test_clips_of_the_demonstrations_are_left_out_where_nothing_is_recorded(
+    make_checkpoint: MakeCheckpoint, tmp_path: Path
+) -> None:
+    make_checkpoint(tmp_path / "clip", dataset={"env_kwargs": {"clips": ["clm_cap12"]}})
+    of = {
+        motion: EvaluationPlan.of(config(tmp_path / "clip", f"--motion {motion}")).env.env_kwargs
+        for motion in ("sway", "recorded+sway")
+    }
+    assert of["sway"] == {"motion": "sway"}
+    assert of["recorded+sway"] == {"clips": ["clm_cap12"], "motion": "recorded+sway"}
 
 
 @pytest.mark.parametrize(

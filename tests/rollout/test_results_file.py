@@ -76,6 +76,7 @@ def test_a_line_gives_the_result_back(result: EpisodeResult) -> None:
         ({"observation": 3}, "'observation' is"),
         ({"version": 4}, "'version' is 4; this release reads 1 to 3"),
         ({"settings": 3}, "'settings' is 3"),
+        ({"motion": None}, "'motion' is null"),
         ({"mood": "good"}, "'mood' is unknown"),
     ],
 )
@@ -97,8 +98,10 @@ def test_numbers_that_json_does_not_know_are_not_written() -> None:
 
 
 def test_rows_of_version_1_and_2_are_read() -> None:
+    moved = replace(MISS, motion="sway:amplitude=0.03")
+    assert EpisodeResult.from_line(moved.to_line()) == moved
     values = json.loads(MISS.to_line())
-    del values["settings"]
+    del values["settings"], values["motion"]
     values["version"] = 2
     assert EpisodeResult.from_line(json.dumps(values)) == MISS
     del values["version"], values["observation"]

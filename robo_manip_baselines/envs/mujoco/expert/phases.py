@@ -59,12 +59,16 @@ class ExpertView:
         object_position: (3,) m, world: the object that the gripper takes, if there is one.
         elapsed: s since the approach to the target may begin; None before.
         is_at_target: the task's condition for the end of the approach holds now.
+        time: s since the start of the episode.
+        gripper_position: (3,) m, world: where the gripper is.
     """
 
     target_track: NDArray[np.float64]
     object_position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     elapsed: float | None = None
     is_at_target: bool = False
+    time: float = 0.0
+    gripper_position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def target(self, lead: float = 0.0) -> NDArray[np.float64]:
         """Return the target ``lead`` s ahead, interpolated; (3,) m. At most 5 frames ahead."""

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, cast
 import gymnasium
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, CameraRenderer
@@ -19,7 +19,12 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MO
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
 from robo_manip_baselines.envs.mujoco.face.model import rotate
-from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, MotionSegment
+from robo_manip_baselines.envs.mujoco.face.motion import (
+    SEGMENT_DURATION,
+    MotionLibrary,
+    MotionSegment,
+)
+from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FRAMES_AHEAD, FaceReplay
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry
 from robo_manip_baselines.observation import (
@@ -64,7 +69,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         render_size: height and width at which cameras are drawn, before `fit_image` makes the
             images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
-        face_motion: start of the recorded motion: ``episode`` or ``after_lift``.
+        face_motion: start of the motion: ``episode`` or ``after_lift``.
+        motion: of the face by name, as `parse_motion` reads it: ``recorded``, ``sway``, ...
         clips: ids of recorded clips to draw from; all if None.
         motion_library: file of ``face_prediction export-motion``; the shipped one if None.
         motion_sha256: digest of the library's motion (`MotionLibrary.sha256`); any if None.
@@ -104,6 +110,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
         face_motion: str = "episode",
+        motion: str | Mapping[str, Any] | Sequence[Any] = "recorded",
         clips: str | Sequence[str] | None = None,
         motion_library: str | Path | None = None,
         motion_sha256: str | None = None,
@@ -130,6 +137,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")
         self.renders_images = True
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
+        self.motion = parse_motion(motion)
         self.clips = _clip_names(clips)
         if not isinstance(motion_library, str | Path | None):
             raise RequestError(f"motion_library {motion_library!r}: must be the path of a file")
@@ -144,6 +152,16 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 )
             if self.library.predicted is None:
                 raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
+            if not self.motion.is_as_recorded:
+                raise RequestError(
+                    f"error model: predictors have seen recorded motion, not '{self.motion}'; "
+                    "choose another error, or the motion 'recorded'"
+                )
+        if self.clips is not None and self.motion.recorded is None:
+            raise RequestError(
+                f"clips {', '.join(self.clips)}: the motion '{self.motion}' has no recording; "
+                "leave them out, or add 'recorded' to the motion"
+            )
         for clip in self.clips or ():
             require_choice("clip", clip, set(self.library.run_clip))
         self.face = FaceModel.load()
@@ -246,7 +264,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.step_count = 0
         self.motion_start: int | None = 0 if self.face_motion == "episode" else None
         self.face_offset = self.np_random.uniform(-FACE_OFFSET, FACE_OFFSET, 3)
-        self.segment: MotionSegment = self.library.draw(self.np_random, clips=self.clips)
+        self.segment: MotionSegment = self.motion.draw(
+            self.np_random, self.library, seed=seed, clips=self.clips
+        )
         self.replay = FaceReplay.lay_out(
             self.segment,
             MOUTH_BASE + self.face_offset,
@@ -324,7 +344,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return values
 
     def start_motion(self) -> None:
-        """Let the recorded motion start now, if it has been waiting."""
+        """Let the motion start now, if it has been waiting."""
         if self.motion_start is None:
             self.motion_start = self.step_count
 
@@ -409,6 +429,15 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         """
         predicted = self.replay.predicted
         return None if predicted is None else predicted[self._row()].copy()
+
+    def mouth_at(self, time: ArrayLike) -> Floats:
+        """(..., 3) m, world: the true mouth at ``time`` (...) s of the episode, past or future.
+
+        A motion that waits for its start is taken to go on waiting.
+        """
+        start = np.inf if self.motion_start is None else self.motion_start * CONTROL_PERIOD
+        moving = np.clip(np.asarray(time, dtype=np.float64) - start, 0.0, SEGMENT_DURATION)
+        return MOUTH_BASE + self.face_offset + self.segment.displacement_at(moving)
 
     def landmark_track(self, landmark: int) -> Floats:
         """(K, 3) m, world: a point of the face now and 1 ... 5 frames ahead.
@@ -517,7 +546,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         }
 
     def _motion_step(self) -> int:
-        """Control steps since the recorded motion started; 0 while it waits."""
+        """Control steps since the motion started; 0 while it waits."""
         return 0 if self.motion_start is None else self.step_count - self.motion_start
 
     def _row(self) -> int:

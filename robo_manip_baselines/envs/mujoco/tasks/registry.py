@@ -340,6 +340,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "arms": (str,),
     "corruption": (dict, type(None)),
     "face_motion": (str,),
+    "motion": (str,),
     "clips": (list, type(None)),
     "motion_library": (str, type(None)),
     "motion_sha256": (str, type(None)),
@@ -441,9 +442,17 @@ FACE_FIELDS = (
 """Fields that every task with a replayed face records."""
 
 FACE_ATTRIBUTES = (
-    Attribute("motion_clip", "text", "Clip that the face's motion was recorded from"),
-    Attribute("motion_subject", "text", "Person in that clip"),
-    Attribute("motion_start_index", "int", "First sample of the segment in the motion library"),
+    Attribute(
+        "motion_clip",
+        "text",
+        "Clip that the face's motion was recorded from; synthetic without a recording",
+    ),
+    Attribute("motion_subject", "text", "Person in that clip, likewise"),
+    Attribute(
+        "motion_start_index",
+        "int",
+        "First sample of the segment in the motion library; -1 without a recording",
+    ),
     Attribute("motion_start_time", "float", "Start of the segment within its run, in s"),
     Attribute("face_offset", "vector", "Offset of the face's base position, in m", length=3),
 )

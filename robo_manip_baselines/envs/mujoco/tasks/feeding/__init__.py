@@ -23,6 +23,7 @@ ENTRY = TaskEntry(
     experts={
         "reactive": f"{_PACKAGE}.expert:reactive",
         "anticipatory": f"{_PACKAGE}.expert:anticipatory",
+        "servo": f"{_PACKAGE}.expert:servo",
     },
     metrics=f"{_PACKAGE}.metrics:FeedingMetrics",
     failures={

@@ -80,7 +80,8 @@ class FeedingEnv(FaceEnv):
 
     - the cube's centre, uniform in x 0.12 ... 0.22 and y 0.42 ... 0.58, on the table;
     - the mouth, (0, 0.5, 0.35) plus a uniform offset of +-0.05 along each axis;
-    - the segment of recorded motion, its start uniform over all starts of the library.
+    - the segment of recorded motion, its start uniform over all starts of the library; or another
+      ``motion``, with the same cube and the same offset.
 
     The mouth then follows the recorded displacement unchanged, with head orientation and jaw, for
     12 s: from the start (``face_motion="episode"``) or from the moment at which the cube has been
@@ -126,6 +127,8 @@ class FeedingEnv(FaceEnv):
     3}``; None shows the truth |
     | ``arms`` | ``"right"`` | right or both |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
+    | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
+    dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
     | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
     None |

@@ -1,10 +1,12 @@
-"""The scripted expert that feeds: Algorithm 1 of the paper, and one that looks ahead."""
+"""Scripted experts that feed: Algorithm 1 of the paper, one that looks ahead, a visual servo."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN
 from robo_manip_baselines.envs.mujoco.expert.phases import (
@@ -19,6 +21,7 @@ from robo_manip_baselines.envs.mujoco.expert.phases import (
     Reach,
     level_at,
 )
+from robo_manip_baselines.envs.mujoco.expert.servo import Forecast, Hold, Insert, ServoConfig
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import is_at_mouth
 from robo_manip_baselines.observation import FRAME_PERIOD
@@ -45,6 +48,15 @@ front of the lips."""
 WITHDRAWAL = np.array([0.14, 0.0, 0.0])
 """m from the mouth to the gripper before it turns home."""
 
+WAITING = 0.08
+"""m before the mouth, along x, where the servo waits until it is in line: the cube is then 3 cm
+before the lips."""
+
+INSERTION_SPEED = 0.10
+"""m/s along x, beside the motion of the mouth, at which the servo goes in."""
+
+WITHDRAWAL_SPEED = 0.30
+"""m/s, likewise, at which it goes out."""
 
 ANTICIPATION = 4 * FRAME_PERIOD
 """s by which ``anticipatory`` looks ahead."""
@@ -60,8 +72,36 @@ def anticipatory(env: FeedingEnv) -> FeedingExpert:
     return FeedingExpert(env, lead=ANTICIPATION)
 
 
+def servo(env: FeedingEnv) -> FeedingServo:
+    """Make the visual servo that aims by its own lag ahead of the true mouth."""
+    return FeedingServo(env)
+
+
+def fetch(place: Callable[[ExpertView], NDArray[np.float64]]) -> list[ExpertPhase]:
+    """Return the phases that take the cube and bring it, level, to a place (3,) m."""
+
+    def over_object(view: ExpertView, height: float) -> Command:
+        position = view.object_position + np.array([0.0, 0.0, height])
+        return Command(position, DOWN, FINGER_OPEN)
+
+    def lifted(view: ExpertView, last: Command) -> Command:
+        return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
+
+    def brought(view: ExpertView, last: Command) -> Command:
+        position = place(view)
+        return Command(position, level_at(position), last.finger)
+
+    return [
+        Reach(lambda view, last: over_object(view, GRASP_OFFSET + CLEARANCE)),
+        Reach(lambda view, last: over_object(view, GRASP_OFFSET), speed=0.15),
+        Grip(FINGER_CLOSED, 0.4),
+        Reach(lifted, speed=0.2),
+        Reach(brought, least_duration=1.2),
+    ]
+
+
 class FeedingExpert(PhasedExpert):
-    """Scripted expert of feeding.
+    """Scripted expert of Algorithm 1.
 
     Args:
         env: the environment, unwrapped.
@@ -80,29 +120,19 @@ class FeedingExpert(PhasedExpert):
             object_position=env.cube_position,
             elapsed=env.progress.time_since_lift(env.time),
             is_at_target=is_at_mouth(env.gripper_position, mouth[0]),
+            time=env.time,
+            gripper_position=env.gripper_position,
         )
 
     def phases(self, home: Command) -> list[ExpertPhase]:
         """Return the phases of one episode, in order."""
 
-        def over_object(view: ExpertView, height: float) -> Command:
-            position = view.object_position + np.array([0.0, 0.0, height])
-            return Command(position, DOWN, FINGER_OPEN)
-
-        def lifted(view: ExpertView, last: Command) -> Command:
-            return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
-
-        def standoff(view: ExpertView, last: Command) -> Command:
-            position = view.target() + STANDOFF
-            return Command(position, level_at(position), last.finger)
+        def standoff(view: ExpertView) -> NDArray[np.float64]:
+            return view.target() + STANDOFF
 
         return [
             # Phase 1: approach and grasp the cube.
-            Reach(lambda view, last: over_object(view, GRASP_OFFSET + CLEARANCE)),
-            Reach(lambda view, last: over_object(view, GRASP_OFFSET), speed=0.15),
-            Grip(FINGER_CLOSED, 0.4),
-            Reach(lifted, speed=0.2),
-            Reach(standoff, least_duration=1.2),
+            *fetch(standoff),
             # Phase 2: move towards the mouth.
             Approach(lead=self._lead),
             # Phase 3: insert the cube into the mouth, let go, retract.
@@ -111,3 +141,43 @@ class FeedingExpert(PhasedExpert):
             Follow(WITHDRAWAL, 0.6, lead=self._lead, speed=0.3),
             Reach(lambda view, last: home),
         ]
+
+
+class FeedingServo(FeedingExpert):
+    """Visual servo that feeds: it fetches the cube as Algorithm 1 does and then tracks the mouth.
+
+    Args:
+        env: the environment, unwrapped.
+        config: lead, delay and limits of the servo.
+        forecast: source of the mouth; the truth if None.
+    """
+
+    def __init__(
+        self,
+        env: FeedingEnv,
+        config: ServoConfig | None = None,
+        forecast: Forecast | None = None,
+    ) -> None:
+        super().__init__(env)
+        self._config = ServoConfig() if config is None else config
+        self._forecast = self._truth if forecast is None else forecast
+
+    def phases(self, home: Command) -> list[ExpertPhase]:
+        """Return the phases of one episode, in order."""
+        forecast, config = self._forecast, self._config
+        inside, out = float(INSERTION[0]), float(WITHDRAWAL[0])
+        letting_go = {"duration": 0.3, "finger": FINGER_OPEN}
+        return [
+            *fetch(lambda view: self._seen(view) + STANDOFF),
+            Insert(forecast, config, goal=inside, rate=INSERTION_SPEED, waiting=WAITING),
+            Hold(forecast, config, goal=inside, rate=INSERTION_SPEED, **letting_go),
+            Hold(forecast, config, goal=out, rate=WITHDRAWAL_SPEED, duration=0.5),
+            Reach(lambda view, last: home),
+        ]
+
+    def _seen(self, view: ExpertView) -> NDArray[np.float64]:
+        """Return the newest mouth seen, (3,) m."""
+        return self._forecast(view.time - self._config.delay * FRAME_PERIOD, 0.0)
+
+    def _truth(self, seen: float, ahead: float) -> NDArray[np.float64]:
+        return self._env.mouth_at(seen + ahead)
