@@ -37,7 +37,8 @@ from robo_manip_baselines.runs.progress import closing_table
 
 ROW_VERSION = 3
 """of a row; version 2 held neither the settings of the evaluation nor the motion, which was
-``recorded``; version 1 did not hold the observation spec either, and named the condition ``arm``."""
+``recorded``; version 1 did not hold the observation spec either, and called the condition
+``arm``."""
 
 SCHEMA = "robo_manip_baselines/evaluation"
 SCHEMA_VERSION = 1
