@@ -156,12 +156,12 @@ def main() -> int:
     threading.Thread(target=_end_with_stdin, daemon=True).start()
     _require_same_software(request)
     folder = Path.cwd()
-    for name, digest in request["inputs"].items():
-        if file_digest(folder / name) != digest:
-            raise RequestError(f"{name} was changed since the benchmark began; start it again")
     with locked(folder, wait=True):
         if read_manifest(folder, request["key"]):
             return 0
+        for name, digest in request["inputs"].items():
+            if file_digest(folder / name) != digest:
+                raise RequestError(f"{name} was changed since the benchmark began; start it again")
         begin = time.perf_counter()
         function: Function = load_part(request["function"])
         if code := function(request["settings"]):

@@ -105,6 +105,10 @@ def with_nan(key: str, index: int = 0) -> Callable[[dict[str, np.ndarray]], None
         (with_value("timestamps", np.zeros(40)), "'timestamps' does not increase at row 1"),
         (with_nan("landmarks", 3), "'landmarks' holds NaN"),
         (with_nan("head_pose", 39), "'head_pose' holds NaN"),
+        (with_value("jaw", np.full(40, -0.01, "f4")), "'jaw' holds distances that are negative"),
+        (with_value("image_size", [0, 480]), "'image_size' must be positive"),
+        (with_value("extra", np.zeros(3)), "unknown array 'extra.npy'"),
+        (with_value("fps", np.inf), "'fps' holds NaN or infinity"),
     ],
 )
 def test_a_damaged_track_is_refused_by_name(track_file: Path, change, message: str) -> None:
@@ -130,6 +134,9 @@ def test_a_damaged_track_is_refused_by_name(track_file: Path, change, message: s
         (with_value("run_start", np.array([0, 40])), "do not divide the frames"),
         (with_value("run_length", np.array([50, 71])), "do not divide the frames"),
         (with_value("metadata", "{"), "'metadata' is not a JSON object"),
+        (with_value("jaw", np.full(120, -0.01, "f4")), "'jaw' is negative at row 0"),
+        (with_value("time", np.zeros(120)), "'time' does not increase in the run from frame 0"),
+        (with_value("run_start", np.array([0, 2**63 - 1])), "do not divide the frames"),
     ],
 )
 def test_a_damaged_library_is_refused_by_name(library_file: Path, change, message: str) -> None:

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from face_prediction.dataset.clip_file import content_digest, read_record
 from face_prediction.dataset.reader import FaceDataset
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -110,3 +111,49 @@ def test_pictures_have_checksums_of_their_own(folder) -> None:
         pytest.raises(RequestError, match=r"one\.h5: image 0: damaged \(its checksum is wrong"),
     ):
         dataset.images(6)
+
+
+def _external(file: h5py.File) -> None:
+    del file["frames/mouth"]
+    file["frames/mouth"] = h5py.ExternalLink("other.h5", "/mouth")
+
+
+def _huge(file: h5py.File) -> None:
+    del file["frames/mouth"]
+    file.create_dataset("frames/mouth", (10**9, 3), "f8", chunks=(1000, 3))
+
+
+def test_clip_files_that_were_changed_are_refused(folder) -> None:
+    """Through HDF5, whose own checksums then agree."""
+    assert folder.run() == 0
+    path = folder.clip("one")
+    content = path.read_bytes()
+    for change, message in (
+        (lambda file: file["frames/mouth"].__setitem__((3, 1), 0.5), "was changed after it was"),
+        (lambda file: file["sequences/start"].__setitem__(0, 10**6), "was changed after it was"),
+        (lambda file: file["pictures/checksum"].__setitem__(0, 1), "was changed after it was"),
+        (_external, "'frames/mouth' is a link to another place or file"),
+        (_huge, "declares 24000000000 bytes"),
+        (lambda file: file.attrs.__setitem__("record", "[" * 100_000), "damaged"),
+    ):
+        with h5py.File(path, "a") as file:
+            change(file)
+        with (
+            FaceDataset(folder.root / "dataset") as dataset,
+            pytest.raises(RequestError, match=message) as caught,
+        ):
+            dataset.read(6)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert "\n" not in str(caught.value)
+        path.write_bytes(content)
+    # A whole file of another content, in its place: the manifest knows.
+    with h5py.File(path, "a") as file:
+        file["frames/mouth"][3, 1] = 0.5  # type: ignore[index]
+        record = {**read_record(path, file), "content_sha256": content_digest(path, file)}
+        kept = {name: record[name] for name in json.loads(str(file.attrs["record"]))}
+        file.attrs["record"] = json.dumps(kept, sort_keys=True)
+    with (
+        FaceDataset(folder.root / "dataset") as dataset,
+        pytest.raises(RequestError, match=r"its frames are not those of the dataset"),
+    ):
+        dataset.read(6)
