@@ -32,6 +32,7 @@ from robo_manip_baselines.data import (
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id, make_env, task_entry
 from robo_manip_baselines.policy.presets import require_at_least
+from robo_manip_baselines.rollout.agreement import VERSIONS
 from robo_manip_baselines.rollout.results import completion_time, require_seeds
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, write_json
@@ -39,6 +40,9 @@ from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_ima
 from robo_manip_baselines.runs.versions import software_versions
 
 SUMMARY = "summary.json"
+
+RECORDING_SOFTWARE = ("mujoco", "numpy", "robo_manip_baselines")
+"""Software whose versions episode files hold."""
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +99,7 @@ def demonstrate(
         "is_success": info["is_success"],
         "is_success_strict": info["is_success_strict"],
         "completion_time": np.nan if time is None else time,
-        "versions": software_versions("mujoco", "numpy", "robo_manip_baselines"),
+        "versions": software_versions(*RECORDING_SOFTWARE),
         "seed": seed,
         "expert": expert,
         "image_codec": codec,
@@ -307,17 +311,24 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
         "image_codec": collection.codec,
         "image_quality": collection.quality,
         "xml_hash": xml_hash,
+        "versions": _deciding_versions(software_versions(*RECORDING_SOFTWARE)),
     }
     for seed in sorted(finished_seeds(collection.out)):
         if (path := collection.path(seed)) is None:
             continue
         there = read_metadata(path)
+        there["versions"] = _deciding_versions(there["versions"])
         for name, value in wanted.items():
             if there[name] != value:
                 raise RequestError(
                     f"'{collection.out}' holds episodes with {name} {there[name]}, not {value} "
                     f"({path.name}); give another --out or remove that folder"
                 )
+
+
+def _deciding_versions(versions: Mapping[str, str]) -> dict[str, str]:
+    """Return the versions of the software that decides how an episode goes."""
+    return {name: versions[name] for name in VERSIONS if name in versions}
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from robo_manip_baselines.data import EpisodeReader, list_episodes, read_metadat
 from robo_manip_baselines.data.schema import EpisodeSchema
 from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
+from robo_manip_baselines.rollout import demonstrate as demonstrate_module
 from robo_manip_baselines.rollout.demonstrate import Collection, collect, deviation
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -111,11 +112,18 @@ def test_carries_on_where_it_was(folder: Path, tmp_path: Path) -> None:
     assert not list(out.glob(".*"))
 
 
-def test_refuses_to_mix_settings(folder: Path, tmp_path: Path) -> None:
+def test_refuses_to_mix_settings(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "mixed"
     shutil.copytree(folder, out)
     with pytest.raises(RequestError, match="holds episodes with expert reactive, not anticip"):
         collect(collection(out, expert="anticipatory"))
+    with monkeypatch.context() as patch:
+        versions = {"python": "3", "mujoco": "3.99", "numpy": "2", "robo_manip_baselines": "1"}
+        patch.setattr(demonstrate_module, "software_versions", lambda *_: versions)
+        with pytest.raises(RequestError, match=r"holds episodes with versions .*, not .*3\.99"):
+            collect(collection(out))
     with pytest.raises(RequestError, match="holds episodes with env_kwargs"):
         collect(collection(out, "--face_motion", "after_lift"))
 
