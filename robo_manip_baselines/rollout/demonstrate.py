@@ -36,6 +36,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     without_library_path,
 )
 from robo_manip_baselines.policy.presets import require_at_least
+from robo_manip_baselines.rollout.agreement import VERSIONS
 from robo_manip_baselines.rollout.results import (
     completion_time,
     require_own_summary,
@@ -52,6 +53,9 @@ SUMMARY = "summary.json"
 
 POLL = 0.2
 """s between looks at the steps that worker processes have taken."""
+
+RECORDING_SOFTWARE = ("mujoco", "numpy", "robo_manip_baselines")
+"""Software whose versions episode files hold."""
 
 logger = logging.getLogger(__name__)
 
@@ -121,7 +125,7 @@ def demonstrate(
         "is_success": info["is_success"],
         "is_success_strict": info["is_success_strict"],
         "completion_time": np.nan if time is None else time,
-        "versions": software_versions("mujoco", "numpy", "robo_manip_baselines"),
+        "versions": software_versions(*RECORDING_SOFTWARE),
         "seed": seed,
         "expert": expert,
         "image_codec": codec,
@@ -406,18 +410,28 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
         "image_codec": collection.codec,
         "image_quality": collection.quality,
         "xml_hash": xml_hash,
+        "versions": _deciding_versions(software_versions(*RECORDING_SOFTWARE)),
     }
     for seed in sorted(finished_seeds(collection.out)):
         if (path := collection.path(seed)) is None:
             continue
         recorded = read_metadata(path)
-        there = {**recorded, "env_kwargs": without_library_path(recorded["env_kwargs"])}
+        there = {
+            **recorded,
+            "env_kwargs": without_library_path(recorded["env_kwargs"]),
+            "versions": _deciding_versions(recorded["versions"]),
+        }
         for name, value in wanted.items():
             if there[name] != value:
                 raise RequestError(
                     f"'{collection.out}' holds episodes with {name} {there[name]}, not {value} "
                     f"({path.name}); give another --out or remove that folder"
                 )
+
+
+def _deciding_versions(versions: Mapping[str, str]) -> dict[str, str]:
+    """Return the versions of the software that decides how an episode goes."""
+    return {name: versions[name] for name in VERSIONS if name in versions}
 
 
 @dataclass(frozen=True)

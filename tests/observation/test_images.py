@@ -13,6 +13,7 @@ import pytest
 
 from robo_manip_baselines.data import EpisodeReader, episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
+from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry, task_names
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.observation.images import fit_image
@@ -154,3 +155,25 @@ def test_the_same_size_is_no_size_of_its_own() -> None:
         if other[0] > given[0] or other[1] > given[1]:
             with pytest.raises(RequestError, match="must be no larger than the render size"):
                 ObservationSpec(image_size=other, render_size=given)
+
+
+def test_a_run_on_squashed_images_is_not_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Runs of earlier releases have no render size, and saw other images than this release's."""
+    from robo_manip_baselines.training import setup as module
+    from robo_manip_baselines.training.config import TrainConfig
+
+    images = make_images(10, cameras=("top",))
+    for seed in (0, 1):
+        path = episode_path(tmp_path, seed, success=True)
+        write_episode(path, make_arrays(10, seed), images, make_attributes(seed))
+    config = TrainConfig.from_preset("Act", "cpu", dataset=tmp_path, out=tmp_path / "run")
+    spec = ObservationSpec(cameras=("top",), image_size=(16, 16))
+    setup = module.TrainSetup.load(replace(config, spec=spec))
+    before = replace(setup.checkpoint(0), spec=spec)
+    monkeypatch.setattr(module, "list_checkpoints", lambda _: [0])
+    monkeypatch.setattr(module, "require_same_config", lambda *_: None)
+    monkeypatch.setattr(module, "read_checkpoint", lambda _: before)
+    with pytest.raises(RequestError, match=r"16x16 drawn at 16x16, .* at 24x32; choose another"):
+        setup.find_start(resume=True)

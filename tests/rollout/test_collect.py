@@ -25,6 +25,7 @@ from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.rollout import demonstrate as demonstrate_module
 from robo_manip_baselines.rollout.demonstrate import (
     Collection,
     collect,
@@ -165,11 +166,18 @@ def test_the_preview_is_the_episode(cameras: str, tmp_path: Path) -> None:
                 assert np.abs(frames[step // 2] - plain).mean() < 3.0
 
 
-def test_refuses_to_mix_settings(folder: Path, tmp_path: Path) -> None:
+def test_refuses_to_mix_settings(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "mixed"
     shutil.copytree(folder, out)
     with pytest.raises(RequestError, match="holds episodes with expert reactive, not anticip"):
         collect(collection(out, expert="anticipatory"))
+    with monkeypatch.context() as patch:
+        versions = {"python": "3", "mujoco": "3.99", "numpy": "2", "robo_manip_baselines": "1"}
+        patch.setattr(demonstrate_module, "software_versions", lambda *_: versions)
+        with pytest.raises(RequestError, match=r"holds episodes with versions .*, not .*3\.99"):
+            collect(collection(out))
     with pytest.raises(RequestError, match="holds episodes with env_kwargs"):
         collect(collection(out, "--face_motion", "after_lift"))
 
