@@ -209,9 +209,8 @@ def write_checkpoint(
     }
     with checkpoint_folder(folder) as temporary:
         for name, tensors in ((MODEL, model_state), (TRAINER_TENSORS, trainer_tensors)):
-            (temporary / name).touch()
-            with text_path(temporary / name) as path:
-                safetensors.torch.save_file(_on_cpu(tensors), path)
+            # not save_file, which takes no path that is not UTF-8
+            (temporary / name).write_bytes(safetensors.torch.save(_on_cpu(tensors)))
         write_json(temporary / CONFIG, config)
         write_json(temporary / STATS, checkpoint.normalization.to_json())
         write_json(temporary / TRAINER, trainer)
