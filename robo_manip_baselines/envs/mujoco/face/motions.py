@@ -86,7 +86,7 @@ class Recorded(MotionPart):
 def replay_faster(library: MotionLibrary, segment: MotionSegment, speed: float) -> MotionSegment:
     """Return the replay of a segment and of what follows it, see `Recorded`."""
     ends = library.run_start + library.run_length
-    (run,) = np.flatnonzero((library.run_start <= segment.index) & (segment.index < ends))
+    run = np.flatnonzero((library.run_start <= segment.index) & (segment.index < ends))[0]
     part = slice(int(library.run_start[run]), int(ends[run]))
     mouth = library.mouth[part] - library.mouth[segment.index]
     whole = replace(
