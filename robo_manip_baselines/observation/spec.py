@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -24,7 +25,9 @@ from robo_manip_baselines.observation.state import (
     State,
     TargetObservation,
 )
+from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.ranges import require_ranges
 
 PRESETS = ("baseline", "current", "current_pred")
 """The paper's three observation groups (section IV.C)."""
@@ -53,8 +56,10 @@ def parse_image_size(size: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
+_Side = Annotated[int, Interval(ge=1, le=MAX_IMAGE_SIZE)]
+
 ImageSize = Annotated[
-    tuple[int, int],
+    tuple[_Side, _Side],
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="HEIGHTxWIDTH",
@@ -97,7 +102,7 @@ class ObservationSpec:
     """
 
     obs: str = "baseline"
-    horizon: int = 2
+    horizon: Annotated[int, Interval(ge=1, le=MAX_HORIZON)] = 2
     cameras: tuple[str, ...] = CAMERAS
     image_size: ImageSize = (480, 640)
     object_pose: bool = False
@@ -114,13 +119,9 @@ class ObservationSpec:
             require_choice("camera", camera, CAMERAS)
         if len(set(self.cameras)) != len(self.cameras):
             raise RequestError(f"cameras {', '.join(self.cameras)}: each may be named once")
-        if not 1 <= self.horizon <= MAX_HORIZON:
-            raise RequestError(f"horizon {self.horizon}: must be 1 to {MAX_HORIZON} frames")
-        size = self.image_size
-        if len(size) != 2 or not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
-            raise RequestError(
-                f"image size {size}: must be height and width, 1 to {MAX_IMAGE_SIZE}"
-            )
+        if len(self.image_size) != 2:
+            raise RequestError(f"image_size {self.image_size}: must be height and width")
+        require_ranges(self)
         if not self.corruption:
             object.__setattr__(self, "corruption", Corruption())
         elif not self.frames:
@@ -149,15 +150,10 @@ class ObservationSpec:
         """Return the spec that ``to_json`` was called on.
 
         Raises:
-            RequestError: a value is not valid.
-            TypeError: a name is unknown.
+            RequestError: a name or a value is not valid.
         """
-        given: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
-        }
-        given.pop("error", None)
-        corruption = Corruption.from_json(given.pop("corruption", None) or {})
-        return cls(**given, corruption=corruption)
+        given = {name: value for name, value in values.items() if name != "error"}
+        return convert({**given, "corruption": given.get("corruption") or {}}, cls, "observation")
 
     def env_kwargs(self) -> dict[str, Any]:
         """Return the arguments of an environment that shows this."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from annotated_types import Interval
 from tqdm import tqdm
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
@@ -18,7 +18,7 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.checkpoint import Checkpoint, load_model, read_checkpoint
-from robo_manip_baselines.policy.presets import ActionExecution, require_at_least
+from robo_manip_baselines.policy.presets import ActionExecution, Chunk
 from robo_manip_baselines.rollout.results import (
     SUMMARY,
     EpisodeResult,
@@ -31,8 +31,10 @@ from robo_manip_baselines.rollout.rollout import ActingPolicy, Recording, rollou
 from robo_manip_baselines.rollout.videos import pick_for_video, video_name, write_video
 from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
+from robo_manip_baselines.runs.documents import as_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_json
+from robo_manip_baselines.runs.ranges import NonNegativeInt, Processes, require_ranges
 from robo_manip_baselines.runs.versions import software_versions
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
@@ -79,20 +81,17 @@ class EvaluationConfig:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     corruption: Corruption | None = None
     temporal_ensemble: bool = False
-    n_action_steps: int | None = None
-    num_envs: int = 8
-    workers: int = 2
+    n_action_steps: Chunk | None = None
+    num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
+    workers: Processes = 2
     device: str = "auto"
     precision: str = "fp32"
-    videos: int = 0
+    videos: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
+        object.__setattr__(self, "env_kwargs", as_json(self.env_kwargs))
         require_seeds(self.seeds)
-        require_at_least(1, self, "num_envs", "n_action_steps")
-        require_at_least(0, self, "workers")
-        if self.videos < 0:
-            raise RequestError(f"video {self.videos}: must be 0 or more")
+        require_ranges(self)
         if self.temporal_ensemble and self.n_action_steps is not None:
             raise RequestError("--temporal_ensemble and --n_action_steps: give one of them")
 
@@ -243,7 +242,7 @@ class EvaluationPlan:
         origin: dict[str, Any] = {
             "policy": checkpoint.policy,
             "condition": self.condition,
-            "observation": json.loads(json.dumps(self.env.spec.to_json())),
+            "observation": as_json(self.env.spec.to_json()),
             "train_seed": checkpoint.train_seed,
             "checkpoint": checkpoint.content_hash,
             "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),

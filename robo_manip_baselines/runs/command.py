@@ -26,6 +26,7 @@ from typing import Any, NoReturn, TypeVar, cast
 import tyro
 
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import require_ranges
 
 Options = TypeVar("Options")
 
@@ -143,6 +144,7 @@ def parse(
             text = text.split("\n\nExample:")[0]
             _call_tyro(options_type, text, [*rest, "--help"], default, program)
         raise RequestError(_unknown_message(unknown, page.getvalue(), program))
+    require_ranges(result)
     return result
 
 

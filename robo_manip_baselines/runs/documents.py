@@ -23,7 +23,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
+
+from typing_extensions import is_typeddict
 
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -277,12 +279,45 @@ class _YamlReader:
         return RequestError(f"{self._source}, line {event.start_mark.line + 1}: {problem}")
 
 
-def read_json(path: Path, kind: type[Kind] = dict, *, limit: int = MAX_BYTES) -> Kind:
+class Schema(NamedTuple):
+    """Name and version of a kind of document, which it holds as ``schema`` and ``version``."""
+
+    name: str
+    version: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the two entries of a document."""
+        return {"schema": self.name, "version": self.version}
+
+    def without(self, value: Any, source: str) -> dict[str, Any]:
+        """Return an object without its ``schema`` and ``version``.
+
+        Raises:
+            RequestError: it is no object, or of another schema or version.
+        """
+        rest = dict(convert(value, dict, source))
+        name, version = rest.pop("schema", None), rest.pop("version", None)
+        if type(version) is not int or (name, version) != self:
+            raise RequestError(
+                f"{source}: schema {shown(name)} version {shown(version)}, this release reads "
+                f"'{self.name}' {self.version}; use the release that wrote it, or make it again"
+            )
+        return rest
+
+
+def read_json(
+    path: Path,
+    kind: type[Kind] = dict,
+    schema: Schema | None = None,
+    *,
+    limit: int = MAX_BYTES,
+) -> Kind:
     """Read a JSON document; its default kind is any object.
 
     Args:
         path: of the file.
         kind: type to convert it to, see `convert`.
+        schema: of the document, where it has one; no part of ``kind``.
         limit: bytes of the file.
 
     Raises:
@@ -291,7 +326,7 @@ def read_json(path: Path, kind: type[Kind] = dict, *, limit: int = MAX_BYTES) ->
     """
     source = f"'{path}'"
     value = parse_json(_decoded(read_bytes(path, limit), source), source, limit)
-    return convert(value, kind, source)
+    return convert(schema.without(value, source) if schema else value, kind, source)
 
 
 def read_yaml(path: Path, kind: type[Kind] = dict) -> Kind:
@@ -344,6 +379,11 @@ def convert(value: Any, kind: type[Kind], source: str) -> Kind:
         raise RequestError(f"{source}: {problem}") from None
 
 
+def as_json(value: Any) -> Any:
+    """Return plain values as JSON gives them back: tuples become lists."""
+    return json.loads(json.dumps(value))
+
+
 def shown(value: Any) -> str:
     """Return a value as a message repeats it: short, whatever it is."""
     if isinstance(value, Mapping):
@@ -352,7 +392,9 @@ def shown(value: Any) -> str:
         return f"a list of {len(value)}"
     if isinstance(value, str):
         return f"'{shortened(value)}'"
-    return shortened(json.dumps(value, default=str))
+    if isinstance(value, int) and value.bit_length() > 128:  # printing it may not be possible
+        return f"an integer of {value.bit_length()} bits"
+    return shortened(repr(value) if isinstance(value, float) else json.dumps(value, default=str))
 
 
 def shortened(message: object, length: int = _SHOWN) -> str:
@@ -375,18 +417,18 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 def _problem(kind: Any, error: ErrorDetails) -> str:
     """Return a line about the first problem of a document."""
     _, *place = error["loc"]
-    context = dict(error.get("ctx", {}))
+    context, template = dict(error.get("ctx", {})), ""
     if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         *place, name = place
         problem = _unknown_name(str(name), _names_at(kind, place))
     elif isinstance(context.get("error"), Exception):
         problem = str(context["error"])
     else:
-        template = _PROBLEMS.get(error["type"])
-        value = shown(error["input"])
-        problem = template.format(value, **context) if template else error["msg"]
+        template = _PROBLEMS.get(error["type"], "")
+        problem = template.format(shown(error["input"]), **context) or error["msg"]
     where = _place(place)
-    return f"{where}: {problem}" if where else problem
+    sign = " " if template.startswith("{}") else ": "  # "horizon 9: must be ..."
+    return f"{where}{sign}{problem}" if where else problem
 
 
 def _place(place: Sequence[int | str]) -> str:
@@ -403,7 +445,7 @@ def _unknown_name(name: str, valid: Sequence[str]) -> str:
 def _names_at(kind: Any, place: Sequence[int | str]) -> list[str]:
     """Return the names of the fields of the dataclass at a place of a type."""
     for part in (*place, None):
-        while not dataclasses.is_dataclass(kind) and not typing.is_typeddict(kind):
+        while not dataclasses.is_dataclass(kind) and not is_typeddict(kind):
             arguments = [a for a in typing.get_args(kind) if a not in (type(None), ...)]
             if not arguments:
                 return []
@@ -416,7 +458,7 @@ def _names_at(kind: Any, place: Sequence[int | str]) -> list[str]:
             kind = typing.get_args(kind)[-1 if typing.get_origin(kind) is dict else 0]
         else:
             kind = typing.get_type_hints(kind).get(part)
-    if not (dataclasses.is_dataclass(kind) or typing.is_typeddict(kind)):
+    if not (dataclasses.is_dataclass(kind) or is_typeddict(kind)):
         return []
     return list(typing.get_type_hints(kind))
 

@@ -21,12 +21,12 @@ from robo_manip_baselines.observation.spec import parse_image_size
 from robo_manip_baselines.policy.presets import (
     ActionExecution,
     TrainSettings,
-    require_at_least,
     with_tuples,
 )
 from robo_manip_baselines.policy.registry import policy_presets
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_text
+from robo_manip_baselines.runs.ranges import Count, Episodes, Seed, require_ranges
 
 Network = TypeVar("Network")
 
@@ -83,21 +83,20 @@ class TrainConfig(Generic[Network]):
     spec: tyro.conf.OmitArgPrefixes[ObservationSpec]
     env: str = "FeedingEnv"
     dataset: Path | None = None
-    num_episodes: int | None = None
+    num_episodes: Episodes | None = None
     preset: str = "cpu"
-    seed: int = 0
+    seed: Seed = 0
     device: str = "auto"
     out: Path | None = None
     logger: str = "tensorboard"
-    log_every: int = 50
-    validate_every: int = 500
-    checkpoint_every: int = 1000
+    log_every: Count = 50
+    validate_every: Count = 500
+    checkpoint_every: Count = 1000
 
     def __post_init__(self) -> None:
         require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
         task_entry(self.env)
-        require_at_least(1, self, "log_every", "validate_every", "checkpoint_every")
-        require_at_least(0, self, "seed")
+        require_ranges(self)
 
     @classmethod
     def from_preset(

@@ -177,7 +177,7 @@ class TrainerState:
             RequestError: the checkpoint lacks the trainer's state, or it is damaged.
         """
         weights = safetensors.torch.load_file(checkpoint.folder / MODEL)
-        tensors, json = read_trainer(checkpoint)
+        tensors, numbers = read_trainer(checkpoint)
         if self.average:
             self.average.model.load_state_dict(weights)
             prefix = "weights/"
@@ -185,19 +185,19 @@ class TrainerState:
         self.model.load_state_dict(weights)
         fused = bool(self.optimizer.defaults["fused"])
         for name, parameter in self._named():
-            if name not in json["optimizer_steps"]:
+            if name not in numbers.optimizer_steps:
                 continue
             device = parameter.device if fused else "cpu"
-            count = torch.tensor(float(json["optimizer_steps"][name]), device=device)
+            count = torch.tensor(float(numbers.optimizer_steps[name]), device=device)
             self.optimizer.state[parameter] = {"step": count}
             for moment in _MOMENTS:  # in the memory layout of the parameter, as AdamW makes them
                 value = torch.empty_like(parameter).copy_(tensors[f"{moment}/{name}"])
                 self.optimizer.state[parameter][moment] = value
-        self.losses.names = tuple(json["metrics"]["names"])
-        self.losses.count = json["metrics"]["count"]
+        self.losses.names = tuple(numbers.metrics["names"])
+        self.losses.count = numbers.metrics["count"]
         if self.losses.count:
             self.losses.sums = tensors["metrics"].to(next(self.model.parameters()).device)
-        return json["seconds"]
+        return numbers.seconds
 
     def _named(self) -> Iterator[tuple[str, nn.Parameter]]:
         trained = set(map(id, self.trained))
