@@ -20,7 +20,7 @@ from robo_manip_baselines.observation.error_models import DRAWN_ERRORS, WORLD_FR
 from robo_manip_baselines.observation.error_stats import load_error_stats
 from robo_manip_baselines.observation.state import FRAME_RATE, Floats, State, TargetObservation
 from robo_manip_baselines.runs.documents import convert
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.errors import RequestError, require_choice, require_printable
 from robo_manip_baselines.runs.ranges import Fraction, Seed, require_ranges
 
 MEASURED_ERRORS = tuple(DRAWN_ERRORS)
@@ -91,6 +91,8 @@ class Corruption:
                 f"error_stats '{self.error_stats}' goes with the errors "
                 f"{', '.join(MEASURED_ERRORS)}, not with '{self.error}'; leave it out"
             )
+        if self.error_stats is not None:
+            require_printable("error_stats", self.error_stats, 4096)
         require_ranges(self)
         length = self.face_dropout_length
         # Losses of that length, however close together, leave at least one frame between them.

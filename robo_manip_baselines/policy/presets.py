@@ -34,11 +34,6 @@ Width = Annotated[int, Interval(ge=1, le=65536)]
 Layers = Annotated[int, Interval(ge=1, le=256)]
 
 
-def with_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values that JSON or YAML held, their lists as the tuples that they were."""
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-
-
 @dataclass(frozen=True)
 class PolicyDims:
     """Dimensions of a policy's inputs and outputs.

@@ -41,6 +41,9 @@ MAX_DEPTH = 64
 MAX_BYTES = 16 << 20
 """Default size of a JSON document."""
 
+IGNORES_OTHERS = {"strict": True, "extra": "ignore", "allow_inf_nan": False}
+"""``__pydantic_config__`` of a dataclass that declares a part of a document only."""
+
 MAX_YAML_BYTES = 1 << 20
 """Size of a YAML document, which people write by hand."""
 
@@ -169,7 +172,23 @@ def parse_json(text: str, source: str, limit: int = MAX_BYTES) -> Any:
     return value
 
 
-def parse_yaml(text: str, source: str) -> Any:
+Place = tuple[int | str, ...]
+"""Names and indices from the top of a document to a value in it."""
+
+
+class YamlDocument(NamedTuple):
+    """Value of a YAML document, and the line on which each value in it begins."""
+
+    value: Any
+    lines: dict[Place, int]
+
+
+def parse_json_bytes(content: bytes, source: str, limit: int = MAX_BYTES) -> Any:
+    """Parse JSON in UTF-8; see `parse_json`."""
+    return parse_json(_decoded(content, source), source, limit)
+
+
+def parse_yaml(text: str, source: str) -> YamlDocument:
     """Parse YAML of plain values: text, numbers, true, false, null, lists and mappings.
 
     Scalars are read as YAML 1.2 does (its core schema): ``1e-4`` is a number, and ``no`` and
@@ -197,7 +216,7 @@ def parse_yaml(text: str, source: str) -> Any:
         raise RequestError(f"{source}{place} is no YAML: {problem}") from None
     except (yaml.YAMLError, ValueError, OverflowError, UnicodeError) as error:
         raise RequestError(f"{source} is no YAML: {shortened(error)}") from None
-    return reader.value
+    return YamlDocument(reader.value, reader.lines)
 
 
 class _YamlReader:
@@ -206,6 +225,7 @@ class _YamlReader:
     def __init__(self, source: str) -> None:
         self._source = source
         self.value: Any = None
+        self.lines: dict[Place, int] = {}
         self._documents = 0
         self._open: list[list[Any] | dict[str, Any]] = []
         self._names: list[str | None] = []  # of each open collection: name that awaits its value
@@ -227,6 +247,7 @@ class _YamlReader:
                 raise self._problem(event, f"nested more than {MAX_DEPTH} deep")
             if self._awaits_name():
                 raise self._problem(event, "a name must be text")
+            self._mark(event)
             self._open.append({} if is_map else [])
             self._names.append(None)
         elif kind in ("SequenceEndEvent", "MappingEndEvent"):
@@ -240,7 +261,14 @@ class _YamlReader:
             if self._awaits_name():
                 self._begin(event)
             else:
+                self._mark(event)
                 self._put(self._scalar(event))
+
+    def _mark(self, event: Any) -> None:
+        """Note the line of the value that begins."""
+        pairs = zip(self._open, self._names, strict=True)
+        place = tuple(len(part) if isinstance(part, list) else str(name) for part, name in pairs)
+        self.lines[place] = event.start_mark.line + 1
 
     def _awaits_name(self) -> bool:
         return bool(self._open) and isinstance(self._open[-1], dict) and self._names[-1] is None
@@ -325,7 +353,7 @@ def read_json(
             the first field that is wrong.
     """
     source = f"'{path}'"
-    value = parse_json(_decoded(read_bytes(path, limit), source), source, limit)
+    value = parse_json_bytes(read_bytes(path, limit), source, limit)
     return convert(schema.without(value, source) if schema else value, kind, source)
 
 
@@ -336,9 +364,19 @@ def read_yaml(path: Path, kind: type[Kind] = dict) -> Kind:
         RequestError: it cannot be read, or is no YAML of that kind; the message names the file and
             the first field that is wrong.
     """
+    value, lines = load_yaml(path)
+    return convert(value, kind, f"'{path}'", lines)
+
+
+def load_yaml(path: Path) -> YamlDocument:
+    """Read a YAML document with its lines; an empty one is an empty mapping.
+
+    Raises:
+        RequestError: it cannot be read, or is no YAML of plain values.
+    """
     source = f"'{path}'"
-    value = parse_yaml(_decoded(read_bytes(path, MAX_YAML_BYTES), source), source)
-    return convert({} if value is None else value, kind, source)
+    value, lines = parse_yaml(_decoded(read_bytes(path, MAX_YAML_BYTES), source), source)
+    return YamlDocument({} if value is None else value, lines)
 
 
 def read_json_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -354,7 +392,9 @@ def read_json_lines(path: Path) -> Iterator[tuple[int, str]]:
         yield number, _decoded(line, f"'{path}', line {number}")
 
 
-def convert(value: Any, kind: type[Kind], source: str) -> Kind:
+def convert(
+    value: Any, kind: type[Kind], source: str, lines: Mapping[Place, int] | None = None
+) -> Kind:
     """Convert plain values, as `parse_json` and `parse_yaml` return them, to a type.
 
     Lists become the tuples, text the paths that the type declares; a whole number is accepted for
@@ -364,6 +404,7 @@ def convert(value: Any, kind: type[Kind], source: str) -> Kind:
         value: plain.
         kind: dataclass, ``TypedDict``, or any type of the standard library that JSON can hold.
         source: first words of messages, such as the quoted path of the file.
+        lines: of a YAML document, for messages.
 
     Raises:
         RequestError: the first field that is wrong, its path and what is valid. A `RequestError`
@@ -375,8 +416,12 @@ def convert(value: Any, kind: type[Kind], source: str) -> Kind:
         # As JSON once more: only there a strict conversion takes lists for tuples.
         return _adapter(kind).validate_json(json.dumps([value]))[0]
     except ValidationError as error:
-        problem = _problem(kind, error.errors(include_url=False)[0])
-        raise RequestError(f"{source}: {problem}") from None
+        first = error.errors(include_url=False)[0]
+        _, *place = first["loc"]
+        while place and tuple(place) not in (lines or {}):
+            place.pop()
+        line = f", line {lines[tuple(place)]}" if lines and place else ""
+        raise RequestError(f"{source}{line}: {_problem(kind, first)}") from None
 
 
 def as_json(value: Any) -> Any:

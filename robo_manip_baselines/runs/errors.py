@@ -22,6 +22,23 @@ def require_choice(what: str, given: str, valid: Iterable[str]) -> str:
     choices = sorted(valid)
     if given in choices:
         return given
-    close = difflib.get_close_matches(given, choices, n=1)
+    text = given if len(given) <= 80 else f"{given[:80]}…"
+    close = difflib.get_close_matches(text, choices, n=1)
     hint = f" (did you mean '{close[0]}'?)" if close else ""
-    raise RequestError(f"unknown {what} '{given}'{hint}; valid: {', '.join(choices)}")
+    raise RequestError(f"unknown {what} '{text}'{hint}; valid: {', '.join(choices)}")
+
+
+def require_printable(what: str, given: str, length: int = 200) -> str:
+    """Return ``given`` if it is one line without control characters, and not too long.
+
+    Figures, tables and pages show it as it is.
+
+    Raises:
+        RequestError: it is not.
+    """
+    if len(given) > length:
+        raise RequestError(f"{what} '{given[:80]}…': must have {length} characters or fewer")
+    for letter in given:
+        if not letter.isprintable():
+            raise RequestError(f"{what} {given!a}: must be one line, without {letter!a}")
+    return given

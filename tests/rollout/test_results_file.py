@@ -182,7 +182,7 @@ def test_folders_that_are_not_ours_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="schema null version null"), open_file(tmp_path):
         pass
     (tmp_path / MANIFEST).write_text('{"schema": "x", "version": 9, "settings": {}}')
-    with pytest.raises(RequestError, match="is of x version 9"), open_file(tmp_path):
+    with pytest.raises(RequestError, match="schema 'x' version 9"), open_file(tmp_path):
         pass
     (tmp_path / "file").write_text("")
     with pytest.raises(RequestError, match="cannot write"), open_file(tmp_path / "file" / "below"):

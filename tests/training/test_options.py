@@ -254,7 +254,7 @@ def test_run_folders(line: str, folder: str) -> None:
         ("Act --error some", ["unknown error model 'some'", "valid: empirical, gaussian"]),
         ("Act --obs current --error uniform", ["'uniform' is one of forecasts", "current_pred"]),
         ("Act --obs baseline --delay 2", ["'delay2' corrupts the mouth"]),
-        ("Act --face_dropout 1", ["face_dropout 1: must be 0 to"]),
+        ("Act --face_dropout 1", ["face_dropout 1.0: must be 0 or more, less than 1"]),
         ("Act --delay x", ["--delay", "'x'"]),
         ("Act --cameras left", ["unknown camera 'left'", "top"]),
         ("Act --image_size big", ["image size 'big'", "480x640"]),
