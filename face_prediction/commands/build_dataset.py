@@ -22,6 +22,7 @@ from face_prediction.dataset.manifest import (
     MANIFEST_NAME,
     TABLE_NAME,
     ClipEntry,
+    Folds,
     Manifest,
     assign_folds,
     read_manifest,
@@ -34,6 +35,7 @@ from face_prediction.dataset.sequences import SequenceSettings, kind_of
 from face_prediction.motion.library import Attribution, read_attributions, track_files
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import require_out_folder
+from robo_manip_baselines.runs.ranges import Seed
 
 logger = logging.getLogger(__name__)
 
@@ -64,8 +66,8 @@ class BuildDatasetOptions:
     out: Path = Path("face_dataset")
     attribution: Path | None = None
     settings: tyro.conf.OmitArgPrefixes[SequenceSettings] = field(default_factory=SequenceSettings)
-    folds: int = 5
-    seed: int = 0
+    folds: Folds = 5
+    seed: Seed = 0
     progress: bool = True
 
 

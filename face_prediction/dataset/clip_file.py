@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 
 from face_prediction.dataset.sequences import STATISTICS, ClipFrames, Sequences
+from robo_manip_baselines.runs.documents import convert, parse_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 from robo_manip_baselines.runs.images import REDUCTIONS
@@ -169,8 +170,11 @@ def read_record(path: Path, file: h5py.File) -> dict[str, Any]:
         RequestError: it is damaged.
     """
     try:
-        record = json.loads(str(file.attrs["record"]))
-        return {**record, **json.loads(str(file.attrs["counts"]))}
+        texts = [str(file.attrs[name]) for name in ("record", "counts")]
+        record, counts = (convert(parse_json(text, str(path)), dict, str(path)) for text in texts)
+        return {**record, **counts}
+    except RequestError:
+        raise
     except READ_ERRORS as error:
         raise RequestError(f"{path}: {damage(error)}") from None
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from annotated_types import Len
 
@@ -20,7 +20,7 @@ from robo_manip_baselines.benchmark.forecasts import FORECASTS
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.policy.registry import policy_entry
-from robo_manip_baselines.runs.documents import convert, load_yaml
+from robo_manip_baselines.runs.documents import convert, load_yaml, shortened
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_printable
 
 CONDITIONS = Path(str(files("robo_manip_baselines.benchmark") / "conditions"))
@@ -156,7 +156,7 @@ class ConditionsDocument:
 
     conditions: Annotated[tuple[Any, ...], Len(1, 1000)]
     env: str = "FeedingEnv"
-    presets: dict[str, Literal["published"] | list[str]] = field(default_factory=dict)
+    presets: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,12 @@ def read_conditions(path: Path) -> ConditionFile:
         file = ConditionFile(
             task.name,
             tuple(conditions),
-            {k: published if v == PUBLISHED else tuple(v) for k, v in document.presets.items()},
+            {
+                name: published
+                if names == PUBLISHED
+                else convert(names, tuple[str, ...], f"presets.{shortened(name)}")
+                for name, names in document.presets.items()
+            },
         )
         for names in file.presets.values():
             file.choose(names)

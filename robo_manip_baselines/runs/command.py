@@ -144,7 +144,7 @@ def parse(
             text = text.split("\n\nExample:")[0]
             _call_tyro(options_type, text, [*rest, "--help"], default, program)
         raise RequestError(_unknown_message(unknown, page.getvalue(), program))
-    require_ranges(result)
+    require_ranges(result, "--{} {}")
     return result
 
 

@@ -393,7 +393,12 @@ def read_json_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def convert(
-    value: Any, kind: type[Kind], source: str, lines: Mapping[Place, int] | None = None
+    value: Any,
+    kind: type[Kind],
+    source: str,
+    lines: Mapping[Place, int] | None = None,
+    *,
+    complete: bool = False,
 ) -> Kind:
     """Convert plain values, as `parse_json` and `parse_yaml` return them, to a type.
 
@@ -405,6 +410,8 @@ def convert(
         kind: dataclass, ``TypedDict``, or any type of the standard library that JSON can hold.
         source: first words of messages, such as the quoted path of the file.
         lines: of a YAML document, for messages.
+        complete: require every field of a dataclass, those with a default, too: it may be another
+            default than when the document was written.
 
     Raises:
         RequestError: the first field that is wrong, its path and what is valid. A `RequestError`
@@ -414,7 +421,7 @@ def convert(
 
     try:
         # As JSON once more: only there a strict conversion takes lists for tuples.
-        return _adapter(kind).validate_json(json.dumps([value]))[0]
+        result = _adapter(kind).validate_json(json.dumps([value]))[0]
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         _, *place = first["loc"]
@@ -422,6 +429,10 @@ def convert(
             place.pop()
         line = f", line {lines[tuple(place)]}" if lines and place else ""
         raise RequestError(f"{source}{line}: {_problem(kind, first)}") from None
+    for item in dataclasses.fields(kind) if complete and dataclasses.is_dataclass(kind) else ():
+        if item.name not in value:
+            raise RequestError(f"{source}: {item.name}: is missing")
+    return result
 
 
 def as_json(value: Any) -> Any:

@@ -12,7 +12,7 @@ import math
 import typing
 from collections.abc import Iterable, Iterator
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
@@ -39,7 +39,7 @@ _ANY = Interval(ge=-(1 << 63), lt=1 << 63)
 def require_ranges(config: Any, given: str = "{} {}") -> None:
     """Require every number of a dataclass, and of dataclasses in it, to be within its range.
 
-    Floats are finite, whatever their range. None is valid where the type says so.
+    Floats are finite, whatever their range; None is valid. Values of a ``Literal`` are one of it.
 
     Args:
         config: a dataclass.
@@ -52,6 +52,10 @@ def require_ranges(config: Any, given: str = "{} {}") -> None:
         value = getattr(config, name)
         for number in value if isinstance(value, (tuple, list)) else (value,):
             _require(given.format(option, shown(number)), number, interval)
+    for name, choices in _choices(type(config)):
+        if (value := getattr(config, name)) not in (*choices, None):
+            valid = ", ".join(map(str, choices))
+            raise RequestError(f"{given.format(name, shown(value))}: unknown; valid: {valid}")
     for item in dataclasses.fields(config):
         part = getattr(config, item.name)
         if dataclasses.is_dataclass(part) and not isinstance(part, type):
@@ -112,10 +116,22 @@ def _numbers(kind: type) -> list[tuple[str, str, Interval]]:
     found = []
     for item in dataclasses.fields(kind):
         parts = list(_parts(hints[item.name]))
-        if {int, float} & set(parts):
+        if any(part in (int, float) for part in parts):
             option = next((name for part in parts if (name := getattr(part, "name", None))), None)
             found.append((item.name, option or item.name, _range_of(parts)))
     return found
+
+
+@cache
+def _choices(kind: type) -> list[tuple[str, tuple[Any, ...]]]:
+    """Return the fields of a dataclass whose type is a ``Literal``, and its values."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return [
+        (item.name, typing.get_args(part))
+        for item in dataclasses.fields(kind)
+        for part in _parts(hints[item.name])
+        if typing.get_origin(part) is Literal
+    ]
 
 
 def _parts(hint: Any) -> Iterator[Any]:

@@ -280,9 +280,9 @@ def test_wrong_command_lines(line: str, parts: list[str]) -> None:
         ("batch_size: many", ["--batch_size is a whole number, not 'many'"]),
         ("batch_size: {a: 1}", ["batch_size must be one value or a list"]),
         ("schedule: linear", ["unknown schedule 'linear'; valid: constant, cosine"]),
-        ("- 3", ["must be lines of 'option: value'"]),
+        ("- 3", ["must be an object, not a list of 1"]),
         ("a: [", ["is no YAML"]),
-        ("policy: Mlp", ["is of policy Mlp, not Act"]),
+        ("policy: Mlp", ["is of policy 'Mlp', not 'Act'"]),
         ("resume: true", ["unknown option 'resume'"]),
     ],
 )

@@ -67,7 +67,7 @@ def test_the_previous_releases_files_read_as_the_same_configuration() -> None:
         ({"policy": "Mpl"}, "unknown policy 'Mpl' .*'Mlp'"),
         ({"policy": "Mlp", "preset": "paper"}, "unknown preset 'paper'"),
         ({"policy": "Mlp", "chunk_siez": 3}, "unknown option 'chunk_siez' .*'chunk_size'"),
-        ({"policy": "Mlp", "steps": 0}, "steps 0: must be 1 to"),
+        ({"policy": "Mlp", "steps": 0}, "steps 0: must be 1 or more"),
         ({"policy": "Mlp", "env": "Feeding"}, "unknown environment 'Feeding'"),
         ({"policy": "Mlp", "error": "some"}, "unknown error model 'some'"),
     ],
