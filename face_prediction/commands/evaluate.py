@@ -39,7 +39,7 @@ from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import file_digest, require_out_folder
-from robo_manip_baselines.runs.ranges import Seed
+from robo_manip_baselines.runs.ranges import Seed, require_ranges
 
 logger = logging.getLogger(__name__)
 

@@ -228,7 +228,7 @@ def load_predictor_error_stats(path: Path) -> PredictorErrorStats:
             promise of `PredictorErrorStats`; the message names the file and the key.
     """
     try:
-        return read_json(path, PredictorErrorStats, SCHEMA, limit=MAX_BYTES)
+        return read_json(path, PredictorErrorStats, SCHEMA, limit=MAX_BYTES, complete=True)
     except RequestError as error:
         raise RequestError(f"{error}; make the file again") from None
 

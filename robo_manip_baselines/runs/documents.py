@@ -339,6 +339,7 @@ def read_json(
     schema: Schema | None = None,
     *,
     limit: int = MAX_BYTES,
+    complete: bool = False,
 ) -> Kind:
     """Read a JSON document; its default kind is any object.
 
@@ -347,6 +348,7 @@ def read_json(
         kind: type to convert it to, see `convert`.
         schema: of the document, where it has one; no part of ``kind``.
         limit: bytes of the file.
+        complete: see `convert`.
 
     Raises:
         RequestError: it cannot be read, or is no JSON of that kind; the message names the file and
@@ -354,7 +356,8 @@ def read_json(
     """
     source = f"'{path}'"
     value = parse_json_bytes(read_bytes(path, limit), source, limit)
-    return convert(schema.without(value, source) if schema else value, kind, source)
+    rest = schema.without(value, source) if schema else value
+    return convert(rest, kind, source, complete=complete)
 
 
 def read_yaml(path: Path, kind: type[Kind] = dict) -> Kind:
@@ -410,7 +413,7 @@ def convert(
         kind: dataclass, ``TypedDict``, or any type of the standard library that JSON can hold.
         source: first words of messages, such as the quoted path of the file.
         lines: of a YAML document, for messages.
-        complete: require every field of a dataclass, those with a default, too: it may be another
+        complete: require every field of dataclasses, those with a default, too: it may be another
             default than when the document was written.
 
     Raises:
@@ -429,9 +432,8 @@ def convert(
             place.pop()
         line = f", line {lines[tuple(place)]}" if lines and place else ""
         raise RequestError(f"{source}{line}: {_problem(kind, first)}") from None
-    for item in dataclasses.fields(kind) if complete and dataclasses.is_dataclass(kind) else ():
-        if item.name not in value:
-            raise RequestError(f"{source}: {item.name}: is missing")
+    if complete and (missing := next(_missing(value, result), "")):
+        raise RequestError(f"{source}: {missing}: is missing")
     return result
 
 
@@ -473,7 +475,9 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 def _problem(kind: Any, error: ErrorDetails) -> str:
     """Return a line about the first problem of a document."""
     _, *place = error["loc"]
-    context, template = dict(error.get("ctx", {})), ""
+    given = error.get("ctx", {}).items()
+    context = {k: f"{v:g}" if isinstance(v, float) else v for k, v in given}
+    template = ""
     if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         *place, name = place
         problem = _unknown_name(str(name), _names_at(kind, place))
@@ -490,6 +494,20 @@ def _problem(kind: Any, error: ErrorDetails) -> str:
 def _place(place: Sequence[int | str]) -> str:
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
     return shortened("".join(parts).removeprefix("."))
+
+
+def _missing(value: Any, result: Any, place: str = "") -> Iterator[str]:
+    """Yield the fields of dataclasses in a converted value that the plain one lacks."""
+    if isinstance(result, (list, tuple)) and result and dataclasses.is_dataclass(result[0]):
+        for number, pair in enumerate(zip(value, result, strict=True)):
+            yield from _missing(*pair, f"{place}[{number}]")
+    elif dataclasses.is_dataclass(result):
+        for item in dataclasses.fields(result):
+            name = f"{place}.{item.name}" if place else item.name
+            if item.name not in value:
+                yield name
+            else:
+                yield from _missing(value[item.name], getattr(result, item.name), name)
 
 
 def _unknown_name(name: str, valid: Sequence[str]) -> str:
@@ -516,6 +534,8 @@ def _names_at(kind: Any, place: Sequence[int | str]) -> list[str]:
             kind = typing.get_type_hints(kind).get(part)
     if not (dataclasses.is_dataclass(kind) or is_typeddict(kind)):
         return []
+    if dataclasses.is_dataclass(kind):
+        return [item.name for item in dataclasses.fields(kind)]
     return list(typing.get_type_hints(kind))
 
 
