@@ -31,7 +31,7 @@ from robo_manip_baselines.runs.documents import (
     shortened,
     shown,
 )
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, require_printable
 from robo_manip_baselines.runs.files import prepare_folder, write_json, write_text
 from robo_manip_baselines.runs.progress import closing_table
 from robo_manip_baselines.runs.ranges import Amount, Episodes, NonNegativeInt, Seed, require_range
@@ -119,6 +119,7 @@ class EpisodeResult:
             raise RequestError(
                 f"{source}: failure {shown(row['failure'])}: unknown; valid: {valid}"
             )
+        require_printable(f"{source}: condition", row["condition"])
         columns = {column.name: row.pop(column.name) for column in task.columns}
         return cls(**row, columns=columns)
 

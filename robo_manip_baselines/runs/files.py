@@ -151,23 +151,6 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, to_json(value))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        RequestError: it is missing, or no JSON object.
-    """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RequestError(f"cannot read '{path}': {error.strerror or error}") from error
-    except ValueError as error:
-        raise RequestError(f"'{path}' is damaged: {error}") from error
-    if not isinstance(value, dict):
-        raise RequestError(f"'{path}' is damaged: it holds no JSON object")
-    return value
-
-
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file, 64 hexadecimal digits."""
     digest = hashlib.sha256()

