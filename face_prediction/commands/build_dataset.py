@@ -23,6 +23,7 @@ from face_prediction.dataset.manifest import (
     TABLE_NAME,
     TABLE_START,
     ClipEntry,
+    Folds,
     Manifest,
     assign_folds,
     read_manifest,
@@ -36,6 +37,7 @@ from face_prediction.motion.attribution import Attribution, find_row, read_attri
 from face_prediction.motion.library import track_files
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder
+from robo_manip_baselines.runs.ranges import Seed
 
 logger = logging.getLogger(__name__)
 
@@ -66,8 +68,8 @@ class BuildDatasetOptions:
     out: Path = Path("face_dataset")
     attribution: Path | None = None
     settings: tyro.conf.OmitArgPrefixes[SequenceSettings] = field(default_factory=SequenceSettings)
-    folds: int = 5
-    seed: int = 0
+    folds: Folds = 5
+    seed: Seed = 0
     progress: bool = True
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Interval
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.dataset.manifest import MANIFEST_NAME
@@ -39,6 +40,7 @@ from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import file_digest, locked, require_out_folder
+from robo_manip_baselines.runs.ranges import Seed, require_ranges
 
 logger = logging.getLogger(__name__)
 
@@ -76,9 +78,9 @@ class EvaluateOptions:
     kinds: tuple[str, ...] = KINDS
     out: Path = Path("results/faces")
     detector_model: Path | None = None
-    seed: int = 0
-    max_sequences: int | None = None
-    resamples: int = 2000
+    seed: Seed = 0
+    max_sequences: Annotated[int, Interval(ge=2, le=10**9)] | None = None
+    resamples: Annotated[int, Interval(ge=1, le=10**6)] = 2000
     shuffle_images: Annotated[bool, tyro.conf.arg(aliases=("--shuffle_pictures",))] = False
     figures: bool = True
     progress: bool = True
@@ -154,10 +156,7 @@ def check_evaluate_options(options: EvaluateOptions) -> None:
     """Raise RequestError if an option is out of its range, before anything is read."""
     for kind in options.kinds:
         require_choice("kind of footage", kind, KINDS)
-    for name, least in (("seed", 0), ("resamples", 1), ("max_sequences", 2)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise RequestError(f"--{name} {value}: {least} or more")
+    require_ranges(options, "--{} {}")
     model = options.detector_model
     if model is not None and not model.is_file():
         raise RequestError(f"--detector_model {model}: no such file")

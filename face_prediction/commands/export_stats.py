@@ -22,8 +22,10 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation.error_stats import (
     PAPER_CAMERA,
     Camera,
+    Length,
     MouthResiduals,
     PredictorErrorStats,
+    ViewAngle,
     data_hash,
     load_predictor_error_stats,
     measure_error_stats,
@@ -37,6 +39,7 @@ from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import FileKind, require_out_file
 from robo_manip_baselines.runs.progress import ProgressBar
+from robo_manip_baselines.runs.ranges import Count, require_ranges
 
 logger = logging.getLogger(__name__)
 
@@ -79,13 +82,13 @@ class ExportStatsOptions:
     library: Path | None = None
     kind: Literal["natural", "head_motion", "grid"] = "natural"
     out: Path = Path("error_stats.json")
-    crop_width: float | None = None
-    crop_height: float | None = None
-    fov_x_deg: float = PAPER_CAMERA.fov_x_deg
-    fov_y_deg: float = PAPER_CAMERA.fov_y_deg
-    depth_m: float = PAPER_CAMERA.depth_m
+    crop_width: Length | None = None
+    crop_height: Length | None = None
+    fov_x_deg: ViewAngle = PAPER_CAMERA.fov_x_deg
+    fov_y_deg: ViewAngle = PAPER_CAMERA.fov_y_deg
+    depth_m: Length = PAPER_CAMERA.depth_m
     keep_runs: bool = True
-    max_run_frames: int | None = None
+    max_run_frames: Count | None = None
     progress: bool = True
 
 
@@ -98,8 +101,7 @@ def run_export_stats(options: ExportStatsOptions) -> int:
     camera = Camera(options.fov_x_deg, options.fov_y_deg, options.depth_m)
     inputs = [options.dataset, options.library, *options.checkpoints]
     require_out_file(options.out, FileKind("error statistics", load_predictor_error_stats), inputs)
-    if options.max_run_frames is not None and options.max_run_frames < 1:
-        raise RequestError(f"--max_run_frames {options.max_run_frames}: 1 or more")
+    require_ranges(options, "--{} {}")
     with FaceDataset(options.dataset) as dataset:
         if options.library is None:
             predictor = cross_fit(dataset, options.checkpoints, options.baseline)

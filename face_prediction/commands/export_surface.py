@@ -21,6 +21,7 @@ from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import FileKind, require_out_file
 from robo_manip_baselines.runs.npz import FileType, read_npz, write_npz
+from robo_manip_baselines.runs.ranges import Count
 
 logger = logging.getLogger(__name__)
 
@@ -60,8 +61,8 @@ class ExportSurfaceOptions:
     tracks: tyro.conf.Positional[tuple[Path, ...]]
     out: Path = Path("face_surface.npz")
     attribution: Path | None = None
-    max_frames: int = 600
-    min_frames: int = 20
+    max_frames: Count = 600
+    min_frames: Count = 20
 
 
 def run_export_surface(options: ExportSurfaceOptions) -> None:

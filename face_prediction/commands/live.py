@@ -7,8 +7,10 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings
@@ -22,6 +24,7 @@ from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoReader, require_video
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import locked_file, require_out_file
+from robo_manip_baselines.runs.ranges import Positive, require_ranges
 from robo_manip_baselines.runs.videos import VIDEO
 
 logger = logging.getLogger(__name__)
@@ -55,13 +58,13 @@ class LiveOptions:
             window, or with Ctrl-C.
     """
 
-    camera: int | None = None
+    camera: Annotated[int, Interval(ge=0, le=1000)] | None = None
     video: Path | None = None
     checkpoint: str = SHIPPED
     dataset: Path | None = None
     out: Path | None = None
     detector_model: Path | None = None
-    seconds: float | None = None
+    seconds: Positive | None = None
 
 
 def run_live(options: LiveOptions) -> int:
@@ -110,10 +113,9 @@ def check_live_options(options: LiveOptions) -> None:
     out, video = options.out, options.video
     if (options.camera is None) == (video is None):
         raise RequestError("give either --camera NUMBER or --video FILE")
+    require_ranges(options, "--{} {}")
     if options.camera is not None and not 0 <= options.camera < MAX_CAMERAS:
         raise RequestError(f"--camera {options.camera}: valid: 0 to {MAX_CAMERAS - 1}")
-    if options.seconds is not None and not options.seconds > 0:
-        raise RequestError(f"--seconds {options.seconds}: must be positive")
     if video is not None:
         require_video(video)
     if out is None:

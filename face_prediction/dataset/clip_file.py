@@ -18,11 +18,12 @@ import h5py
 import numpy as np
 
 from face_prediction.dataset.sequences import STATISTICS, ClipFrames, Sequences
+from robo_manip_baselines.runs.documents import convert, parse_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_hdf5
 from robo_manip_baselines.runs.hdf5 import IN_USE, READ_ERRORS, attribute_of, dataset_of, open_hdf5
 from robo_manip_baselines.runs.images import REDUCTIONS
-from robo_manip_baselines.runs.npz import add_array, parse_json
+from robo_manip_baselines.runs.npz import add_array
 
 SCHEMA = "face_dataset_clip"
 VERSION = 1
@@ -238,10 +239,8 @@ def read_record(path: Path, file: h5py.File) -> dict[str, Any]:
     try:
         for name in ("record", "counts"):
             given = attribute_of(file, name)
-            part = parse_json(given if isinstance(given, str) else given.decode(), f"'{name}'")
-            if not isinstance(part, dict):
-                raise TypeError(f"'{name}' is no JSON object")
-            result |= part
+            text = given if isinstance(given, str) else given.decode()
+            result |= convert(parse_json(text, f"'{name}'"), dict, f"'{name}'")
         size = result["image_size"]
         if not (isinstance(size, list) and [type(x) for x in size] == [int, int] and min(size) > 0):
             raise ValueError(f"image_size {str(size)[:40]}")

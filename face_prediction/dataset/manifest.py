@@ -7,15 +7,21 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from face_prediction.dataset.sequences import STATISTICS, SequenceSettings
+from robo_manip_baselines.runs.documents import Schema, read_json, shown
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file, read_json, to_json, write_text
+from robo_manip_baselines.runs.files import atomic_file, to_json, write_text
+from robo_manip_baselines.runs.ranges import NonNegativeInt, Seed, require_range
 
-SCHEMA = "face_dataset"
-VERSION = 1
+SCHEMA = Schema("face_dataset", 1)
+MAX_BYTES = 64 << 20
+"""Size of the manifest: some 100,000 clips."""
+
 MANIFEST_NAME = "dataset.json"
 TABLE_NAME = "sequences.csv"
 TABLE_START = "clip,number,subject,kind,fold,start"
@@ -25,6 +31,9 @@ ALL_FOOTAGE = 0.25
 """Weight of a fold's share of all footage beside its share of a person's own kinds. Little: kinds
 are reported apart, so that each fold should hold some of every kind; with more, the 400 clips of
 one GRID speaker would have a fold to themselves."""
+
+
+Folds = Annotated[int, Interval(ge=1, le=1000)]
 
 
 @dataclass(frozen=True)
@@ -51,16 +60,16 @@ class ClipEntry:
     clip: str
     subject: str
     kind: str
-    fold: int | None
+    fold: NonNegativeInt | None
     ship: bool
     licence: str
     source: str
     track_sha256: str
     video: str
     video_sha256: str
-    sequences: int
-    candidates: int
-    dropped: dict[str, int]
+    sequences: NonNegativeInt
+    candidates: NonNegativeInt
+    dropped: dict[str, NonNegativeInt]
     content_sha256: str = ""
 
 
@@ -76,8 +85,32 @@ class Manifest:
     """
 
     settings: SequenceSettings
-    folds: int
-    seed: int
+    folds: Folds
+    seed: Seed
+    clips: tuple[ClipEntry, ...]
+
+    def __post_init__(self) -> None:
+        fold_of: dict[str, int | None] = {}
+        for clip in self.clips:
+            if Path(clip.clip).name != clip.clip:
+                raise RequestError(f"{shown(clip.clip)} is no name of a clip")
+            if clip.sequences and clip.fold not in range(self.folds):
+                wrong = f"is in fold {clip.fold}, there are {self.folds}"
+                raise RequestError(f"clip '{clip.clip}' {wrong}")
+            if fold_of.setdefault(clip.subject, clip.fold) != clip.fold:
+                raise RequestError(f"subject '{clip.subject}' is in two folds")
+        if len({clip.clip for clip in self.clips}) < len(self.clips):
+            raise RequestError("a clip is there twice")
+
+
+@dataclass(frozen=True)
+class ManifestDocument:
+    """Content of ``dataset.json``; see `Manifest`. ``subjects``: fold of each person."""
+
+    settings: dict[str, Any]
+    folds: Folds
+    seed: Seed
+    subjects: dict[str, NonNegativeInt]
     clips: tuple[ClipEntry, ...]
 
 
@@ -123,10 +156,8 @@ def assign_folds(clips: Iterable[ClipEntry], folds: int, seed: int) -> dict[str,
 
 def require_fold_options(folds: int, seed: int) -> None:
     """Raise RequestError if a number is out of its range, before any work is done."""
-    if folds < 1:
-        raise RequestError(f"--folds {folds}: 1 or more")
-    if seed < 0:
-        raise RequestError(f"--seed {seed}: 0 or more")
+    require_range("--folds", folds, Folds)
+    require_range("--seed", seed, Seed)
 
 
 @dataclass(frozen=True)
@@ -157,8 +188,7 @@ def fold_split(folds: int, test: int) -> FoldSplit:
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write ``dataset.json``, whole or not at all."""
     content = {
-        "schema": SCHEMA,
-        "version": VERSION,
+        **SCHEMA.to_json(),
         "settings": manifest.settings.to_json(),
         "folds": manifest.folds,
         "seed": manifest.seed,
@@ -179,32 +209,13 @@ def read_manifest(folder: Path) -> Manifest:
     if not path.is_file():
         missing = f"no dataset ({MANIFEST_NAME} is not there)"
         raise RequestError(f"{folder}: {missing}; make one with build-dataset")
-    again = "make the dataset again"
     try:
-        data = read_json(path)
+        stored = read_json(path, ManifestDocument, SCHEMA, limit=MAX_BYTES)
+        settings = SequenceSettings.from_json(stored.settings)
+        return Manifest(settings, stored.folds, stored.seed, stored.clips)
     except RequestError as error:
-        raise RequestError(f"{error}; {again}") from None
-    if (found := (data.get("schema"), data.get("version"))) != (SCHEMA, VERSION):
-        kind = f"schema '{found[0]}' version {found[1]}"
-        raise RequestError(f"{path}: {kind}, expected '{SCHEMA}' {VERSION}; {again}")
-    try:
-        clips = tuple(ClipEntry(**row) for row in data["clips"])
-        settings = SequenceSettings.from_json(data["settings"])
-        manifest = Manifest(settings, int(data["folds"]), int(data["seed"]), clips)
-    except (KeyError, TypeError, ValueError) as error:
-        raise RequestError(f"{path}: not as expected ({error}); {again}") from None
-    fold_of: dict[str, int | None] = {}
-    for clip in manifest.clips:
-        if Path(clip.clip).name != clip.clip:
-            raise RequestError(f"{path}: '{clip.clip}' is no name of a clip")
-        if clip.sequences and clip.fold not in range(manifest.folds):
-            wrong = f"is in fold {clip.fold}, there are {manifest.folds}"
-            raise RequestError(f"{path}: clip '{clip.clip}' {wrong}")
-        if fold_of.setdefault(clip.subject, clip.fold) != clip.fold:
-            raise RequestError(f"{path}: subject '{clip.subject}' is in two folds")
-    if len({clip.clip for clip in manifest.clips}) < len(manifest.clips):
-        raise RequestError(f"{path}: a clip is there twice")
-    return manifest
+        text = str(error) if str(path) in str(error) else f"'{path}': {error}"
+        raise RequestError(f"{text}; make the dataset again") from None
 
 
 @dataclass(frozen=True)

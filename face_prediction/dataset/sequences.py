@@ -5,21 +5,24 @@ Legend: T frames, S decoded frames, N sequences, F frames of one, L = 468 landma
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from annotated_types import Interval
 
 from face_prediction.motion.attribution import Attribution
 from face_prediction.motion.motion import Quality, QualityLimits, assess
 from face_prediction.tracking.extract import SAME_TIME, Samples, resample
 from face_prediction.tracking.geometry import LIPS, Crop, crop_around, lift_landmarks
 from face_prediction.tracking.tracks import FaceTrack, Size
+from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import Quality as JpegQuality
+from robo_manip_baselines.runs.ranges import require_ranges
 
 CropFrom = Literal["history", "sequence"]
 
@@ -53,33 +56,18 @@ class SequenceSettings:
         RequestError: a value is out of its range; the message names the option.
     """
 
-    history: int = 70
-    future: int = 5
-    fps: float = 30.0
-    stride: int = 15
-    margin: float = 0.1
+    history: Annotated[int, Interval(ge=1, le=10_000)] = 70
+    future: Annotated[int, Interval(ge=1, le=10_000)] = 5
+    fps: Annotated[float, Interval(gt=0.0, le=1000.0)] = 30.0
+    stride: Annotated[int, Interval(ge=1, le=1_000_000)] = 15
+    margin: Annotated[float, Interval(ge=0.0, le=2.0)] = 0.1
     crop_from: CropFrom = "history"
-    crop_size: int = 256
-    quality: int = 90
+    crop_size: Annotated[int, Interval(ge=16, le=4096)] = 256
+    quality: JpegQuality = 90
     limits: tyro.conf.Suppress[QualityLimits] = field(default_factory=QualityLimits)
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("history", 1, 10_000),
-            ("future", 1, 10_000),
-            ("stride", 1, 1_000_000),
-            ("crop_size", 16, 4096),
-            ("quality", 1, 100),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise RequestError(f"--{name} {value}: between {low} and {high}")
-        if not 0.0 < self.fps <= 1000.0:
-            raise RequestError(f"--fps {self.fps}: more than 0, up to 1000")
-        if not (math.isfinite(self.margin) and 0.0 <= self.margin <= 2.0):
-            raise RequestError(f"--margin {self.margin}: between 0 and 2")
-        if self.crop_from not in ("history", "sequence"):
-            raise RequestError(f"--crop_from {self.crop_from}: history or sequence")
+        require_ranges(self, "--{} {}")
 
     @property
     def length(self) -> int:
@@ -97,13 +85,7 @@ class SequenceSettings:
         Raises:
             RequestError: ``data`` holds other keys or values that are no settings.
         """
-        wanted = {item.name for item in fields(cls)}
-        if not isinstance(data, Mapping) or set(data) != wanted:
-            raise RequestError(f"settings need the keys {', '.join(sorted(wanted))}")
-        try:
-            return cls(**{**data, "limits": QualityLimits(**data["limits"])})
-        except TypeError as error:
-            raise RequestError(f"settings are not as expected: {error}") from None
+        return convert(data, cls, "settings", complete=True)
 
 
 def kind_of(row: Attribution) -> str:

@@ -9,20 +9,25 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from face_prediction.prediction.errors import Floats, has_forecast, mouth_errors
+from robo_manip_baselines.runs.documents import Schema, read_json
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import read_json, to_json, write_text
+from robo_manip_baselines.runs.files import to_json, write_text
+from robo_manip_baselines.runs.ranges import Count, NonNegativeInt, require_ranges
 
-SCHEMA = "error_stats"
-VERSION = 1
+SCHEMA = Schema("error_stats", 1)
+MAX_BYTES = 64 << 20
+"""Size of a file: hours of residuals."""
+
 EQUATIONS = (
     "max_dx = 2 * depth_m * tan(fov_x_deg / 2) * crop_width * dU",
     "max_dy = 2 * depth_m * tan(fov_y_deg / 2) * crop_height * dV",
@@ -32,6 +37,10 @@ QUANTILE_LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 MAX_LAG = 10  # strides that the autocorrelation is measured over, where a clip is long enough
 _DECIMALS = 6  # of residuals in a run: a millionth of a crop, finer than any detector
 _TOLERANCE = 1e-6  # relative agreement asked of numbers that follow from others in the file
+
+
+ViewAngle = Annotated[float, Interval(gt=0.0, lt=180.0)]
+Length = Annotated[float, Interval(gt=0.0, le=1e6)]
 
 
 @dataclass(frozen=True)
@@ -48,17 +57,14 @@ class Camera:
         crop_height: the same of the height.
     """
 
-    fov_x_deg: float = 75.0
-    fov_y_deg: float = 47.0
-    depth_m: float = 0.5
-    crop_width: float = 1.0
-    crop_height: float = 1.0
+    fov_x_deg: ViewAngle = 75.0
+    fov_y_deg: ViewAngle = 47.0
+    depth_m: Length = 0.5
+    crop_width: Length = 1.0
+    crop_height: Length = 1.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            limit = 180.0 if name.startswith("fov") else np.inf
-            if not 0 < value < limit:
-                raise RequestError(f"camera: {name} {value}; must be above 0 and below {limit}")
+        require_ranges(self, "camera: {} {}")
 
     def metres(self, errors: NDArray[np.floating]) -> Floats:
         """Errors (..., 2) across and up in metres, parallel to the image, of (dU, dV)."""
@@ -98,9 +104,9 @@ class HorizonErrors:
         mean_abs_m: equations 6 and 7 of ``mean_abs``: (across, up) in metres.
     """
 
-    frames: int
-    forecasts: int
-    missing: int
+    frames: Count
+    forecasts: NonNegativeInt
+    missing: NonNegativeInt
     mean_abs: tuple[float, ...]
     var_abs: tuple[float, ...]
     bias: tuple[float, ...]
@@ -143,9 +149,9 @@ class PredictorErrorStats:
     predictor: str
     footage: str
     fps: float
-    stride_frames: int
-    sequences: int
-    subjects: int
+    stride_frames: Count
+    sequences: Count
+    subjects: Count
     data_sha256: str
     camera: Camera
     equations: tuple[str, ...]
@@ -204,16 +210,13 @@ class PredictorErrorStats:
             _finite(run.values, f"residuals[{number}]", (None, size, 2))
 
 
-_NESTED = {kind.__name__: kind for kind in (Camera, HorizonErrors, ResidualRun)}
-
-
 def save_predictor_error_stats(path: Path, stats: PredictorErrorStats) -> None:
     """Write ``stats`` to ``path``, whole or not at all.
 
     Raises:
         RequestError: the folder cannot be written.
     """
-    write_text(path, compact_json({"schema": SCHEMA, "version": VERSION, **asdict(stats)}))
+    write_text(path, compact_json({**SCHEMA.to_json(), **asdict(stats)}))
 
 
 def load_predictor_error_stats(path: Path) -> PredictorErrorStats:
@@ -223,21 +226,10 @@ def load_predictor_error_stats(path: Path) -> PredictorErrorStats:
         RequestError: the file is absent, damaged, of another schema or version, or breaks a
             promise of `PredictorErrorStats`; the message names the file and the key.
     """
-    if not path.is_file():
-        raise RequestError(f"{path}: no such file; expected '{SCHEMA}' as JSON")
-    stored = read_json(path)
-    schema, version = stored.pop("schema", None), stored.pop("version", None)
-    if schema != SCHEMA:
-        raise RequestError(f"{path}: schema '{schema}', expected '{SCHEMA}'")
-    if version != VERSION:
-        raise RequestError(
-            f"{path}: version {version} of '{SCHEMA}', this program reads {VERSION}; make the file "
-            "again"
-        )
     try:
-        return _from_json(PredictorErrorStats, stored, "")
+        return read_json(path, PredictorErrorStats, SCHEMA, limit=MAX_BYTES, complete=True)
     except RequestError as error:
-        raise RequestError(f"{path}: {error}; make the file again") from None
+        raise RequestError(f"{error}; make the file again") from None
 
 
 def compact_json(record: Mapping[str, Any]) -> str:
@@ -412,31 +404,6 @@ def _finite(values: Any, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
     if not (fits and np.all(np.isfinite(array))):
         raise RequestError(f"'{key}' must be finite, of shape ({wanted})")
     return array
-
-
-def _from_json(annotation: Any, value: Any, where: str) -> Any:
-    """A value of a field, checked: a dataclass from exactly its fields, lists made tuples."""
-    if isinstance(annotation, str) and annotation.startswith("tuple["):
-        inner = annotation.removeprefix("tuple[").removesuffix(", ...]")
-        if isinstance(value, list):
-            places = range(len(value))
-            names = [f"{where}[{i}]" if inner in _NESTED else where for i in places]
-            return tuple(map(_from_json, [inner] * len(value), value, names))
-    elif annotation in ("int", "float", "str"):
-        kinds = {"int": int, "float": (int, float), "str": str}[annotation]
-        if isinstance(value, kinds) and not isinstance(value, bool):
-            return value
-    elif isinstance(value, Mapping):
-        kind: Any = _NESTED.get(annotation, annotation)
-        types = {field.name: field.type for field in fields(kind)}
-        prefix = where and f"{where}."
-        for key in (*types, *value):
-            if key not in value:
-                raise RequestError(f"'{prefix}{key}' is missing")
-            if key not in types:
-                raise RequestError(f"'{prefix}{key}' is not a key of this schema")
-        return kind(**{k: _from_json(t, value[k], prefix + k) for k, t in types.items()})
-    raise RequestError(f"'{where}' is not of type {annotation}")
 
 
 def _as_tuples(values: Any) -> Any:

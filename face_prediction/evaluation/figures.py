@@ -118,7 +118,7 @@ def draw_forecast(
     # squares of known size: a layout that looks for the best takes seconds for twenty of them
     width, height = _LEFT + _STEP * count + _EDGE, _TOP + _STEP * 4 + _EDGE
     figure = new_matplotlib_figure(width, height, layout=None)
-    figure.suptitle(title, y=1 - 0.1 / height, va="top")
+    figure.suptitle(title, y=1 - 0.1 / height, va="top", parse_math=False)
     grid = figure.subplots(4, count, squeeze=False)
     # left, bottom, right, top
     edges = (_LEFT / width, _EDGE / height, 1 - _EDGE / width, 1 - _TOP / height)
@@ -158,7 +158,7 @@ def _draw_curves(
     for axes, summary in zip(panels, summaries, strict=True):
         people = "person" if summary.subjects == 1 else "people"
         title = f"{summary.kind}: {summary.sequences} sequences, {summary.subjects} {people}"
-        axes.set_title(title, fontsize="medium")
+        axes.set_title(title, fontsize="medium", parse_math=False)
         axes.grid(alpha=0.3)
         number = summary.numbers[key]
         networks = others = 0

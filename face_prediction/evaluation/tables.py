@@ -21,7 +21,8 @@ from face_prediction.evaluation.error_stats import compact_json
 from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
-from robo_manip_baselines.runs.files import FolderKind, read_json, write_text
+from robo_manip_baselines.runs.documents import read_json
+from robo_manip_baselines.runs.files import FolderKind, write_text
 
 Format = Callable[[float], str]
 Column = tuple[str, tuple[Any, ...], Format, str | None]

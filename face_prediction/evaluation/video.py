@@ -232,7 +232,7 @@ class _Stage:
         grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.4))
         face = figure.add_subplot(grid[:, 0])
         face.set(aspect="equal", xticks=[], yticks=[])
-        face.set_title(f"{timeline.clip}, {SLOWED} times slower", fontsize=13)
+        face.set_title(f"{timeline.clip}, {SLOWED} times slower", fontsize=13, parse_math=False)
         seconds = timeline.frames / timeline.fps
         plots: list[Any] = []
         for axis, label in enumerate(("mouth to the right, px", "mouth down, px")):

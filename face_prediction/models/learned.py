@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +20,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from typing_extensions import TypedDict
 
 from face_prediction.models.interface import History, Output, PredictorModel
 from face_prediction.models.settings import make_predictor_model, settings_class
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs import tensors as tensor_files
+from robo_manip_baselines.runs.documents import Schema, convert, parse_json, read_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
-from robo_manip_baselines.runs.files import atomic_file, read_json, write_json
-from robo_manip_baselines.runs.npz import parse_json
+from robo_manip_baselines.runs.files import atomic_file, write_json
+from robo_manip_baselines.runs.ranges import NonNegativeInt, Seed
 from robo_manip_baselines.runs.tensors import require_alike, require_finite
 
 try:
@@ -39,7 +41,7 @@ except ModuleNotFoundError:
         f"networks need safetensors; run: {install_command('face-prediction')}"
     ) from None
 
-KIND = {"schema": "face_predictor", "version": 1}
+SCHEMA = Schema("face_predictor", 1)
 MODEL_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 
@@ -168,6 +170,14 @@ def _arrays(output: Output, horizon: int) -> dict[str, NDArray[Any]]:
     return arrays
 
 
+class FoldUses(TypedDict):
+    """Folds of people by their use."""
+
+    train: list[NonNegativeInt]
+    validation: list[NonNegativeInt]
+    test: list[NonNegativeInt]
+
+
 @dataclass(frozen=True)
 class CheckpointRecord:
     """Provenance of a trained network.
@@ -189,12 +199,12 @@ class CheckpointRecord:
     settings: dict[str, Any]
     preset: str
     training: dict[str, Any]
-    seed: int
+    seed: Seed
     dataset: dict[str, Any]
     dataset_sha256: str
-    folds: dict[str, list[int]]
+    folds: FoldUses
     train_subjects: list[str]
-    step: int
+    step: NonNegativeInt
     validation: dict[str, float]
     versions: dict[str, str]
 
@@ -207,8 +217,8 @@ def save_predictor_checkpoint(
     Raises:
         RequestError: the folder cannot be written to.
     """
-    digest = write_tensors(folder / MODEL_FILE, state, KIND)
-    write_json(folder / CONFIG_FILE, {**KIND, **asdict(record), "model_sha256": digest})
+    digest = write_tensors(folder / MODEL_FILE, state, SCHEMA.to_json())
+    write_json(folder / CONFIG_FILE, {**SCHEMA.to_json(), **asdict(record), "model_sha256": digest})
 
 
 def read_predictor_checkpoint(folder: Path) -> tuple[CheckpointRecord, dict[str, Tensor]]:
@@ -220,13 +230,12 @@ def read_predictor_checkpoint(folder: Path) -> tuple[CheckpointRecord, dict[str,
     """
     path = folder / CONFIG_FILE
     _require_file(path)
-    data = read_json(path)
-    require_kind(path, data, KIND)
+    data = read_json(path, schema=SCHEMA)
+    expected = data.pop("model_sha256", None)
     try:
-        record = CheckpointRecord(**{x.name: data[x.name] for x in fields(CheckpointRecord)})
-        expected = data["model_sha256"]
-    except KeyError as error:
-        raise RequestError(f"{path}: key {error} is missing; train the network again") from None
+        record = convert(data, CheckpointRecord, f"'{path}'")
+    except RequestError as error:
+        raise RequestError(f"{error}; train the network again") from None
     tensors, _, digest = read_tensors(folder / MODEL_FILE)
     if digest != expected:
         raise RequestError(
@@ -271,7 +280,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     _require_file(path)
     tensors, metadata = tensor_files.read_tensors(path)
     try:
-        record = parse_json(metadata["record"], f"{path}: its record")
+        record = convert(parse_json(metadata["record"], f"'{path}'"), dict, f"'{path}'")
         digest = record.pop("sha256")
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise RequestError(
@@ -280,19 +289,6 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     if tensor_hash(tensors) != digest:
         raise RequestError(f"{path}: damaged (its tensors are not those that were written)")
     return tensors, record, digest
-
-
-def require_kind(path: Path, record: Mapping[str, Any], kind: Mapping[str, Any]) -> None:
-    """Check the schema and version in a file's record.
-
-    Raises:
-        RequestError: it is of another schema or version.
-    """
-    if any(record.get(key) != value for key, value in kind.items()):
-        raise RequestError(
-            f"{path}: schema '{record.get('schema')}' version {record.get('version')}, expected "
-            f"'{kind['schema']}' {kind['version']}"
-        )
 
 
 def tensor_hash(tensors: Mapping[str, Tensor]) -> str:

@@ -8,10 +8,14 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+from annotated_types import Interval
+
+from robo_manip_baselines.runs.documents import as_json, convert
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import require_ranges
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -21,18 +25,13 @@ if TYPE_CHECKING:
 Decay = Literal["constant", "cosine"]
 Precision = Literal["auto", "fp32", "bf16"]
 
-IMAGE_SIZES = (32, 64, 128, 256)
+ImageSize = Literal[32, 64, 128, 256]
 """Sides of images that a network can see: 256, and the fractions that JPEG decodes directly."""
-
-
-def _within(default: Any, low: float, high: float) -> Any:
-    """Declare a field for numbers from ``low`` to ``high``."""
-    return field(default=default, metadata={"range": (low, high)})
 
 
 @dataclass(frozen=True)
 class _CheckedSettings:
-    """Settings whose fields declare what is valid.
+    """Settings whose fields declare their ranges.
 
     Attributes:
         given: format of a name and a value in error messages.
@@ -44,15 +43,7 @@ class _CheckedSettings:
     given: ClassVar[str]
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            given = self.given.format(item.name, value)
-            low, high = item.metadata.get("range", (-math.inf, math.inf))
-            choices = item.metadata.get("choices", (value,))
-            if value not in choices:
-                raise RequestError(f"{given}: unknown; valid: {', '.join(map(str, choices))}")
-            if isinstance(value, (int, float)) and not low <= value <= high:
-                raise RequestError(f"{given}: out of range; valid: {low} to {high:g}")
+        require_ranges(self, self.given)
 
 
 @dataclass(frozen=True)
@@ -65,17 +56,17 @@ class PredictorTrainSettings(_CheckedSettings):
 
     given: ClassVar[str] = "--{} {}"
 
-    steps: int = _within(20_000, 1, 1e9)
-    batch_size: int = _within(16, 1, 65536)
-    learning_rate: float = _within(1e-4, 0.0, 10.0)
-    schedule: Decay = field(default="constant", metadata={"choices": get_args(Decay)})
-    warmup_steps: int = _within(0, 0, 1e9)
-    clip_norm: float = _within(1.0, 0.0, 1e9)
-    ema_decay: float = _within(0.0, 0.0, 0.999999)
+    steps: Annotated[int, Interval(ge=1, le=10**9)] = 20_000
+    batch_size: Annotated[int, Interval(ge=1, le=65536)] = 16
+    learning_rate: Annotated[float, Interval(ge=0.0, le=10.0)] = 1e-4
+    schedule: Decay = "constant"
+    warmup_steps: Annotated[int, Interval(ge=0, le=10**9)] = 0
+    clip_norm: Annotated[float, Interval(ge=0.0, le=1e9)] = 1.0
+    ema_decay: Annotated[float, Interval(ge=0.0, le=0.999999)] = 0.0
     augment: bool = False
-    precision: Precision = field(default="auto", metadata={"choices": get_args(Precision)})
-    validate_every: int = _within(500, 1, 1e9)
-    validation_sequences: int = _within(96, 0, 1e9)
+    precision: Precision = "auto"
+    validate_every: Annotated[int, Interval(ge=1, le=10**9)] = 500
+    validation_sequences: Annotated[int, Interval(ge=0, le=10**9)] = 96
 
     def learning_rate_at(self, step: int) -> float:
         """Learning rate of the optimizer step that follows ``step`` others."""
@@ -108,10 +99,7 @@ class ModelSettings(_CheckedSettings):
         Raises:
             RequestError: keys are missing or unknown, or a value is not valid.
         """
-        names = {item.name for item in fields(cls)}
-        if not isinstance(data, Mapping) or set(data) != names:
-            raise RequestError(f"{cls.__name__} needs the keys {', '.join(sorted(names))}")
-        return cls().changed(data)
+        return convert(data, cls, "settings", complete=True)
 
     def changed(self, values: Mapping[str, Any]) -> Self:
         """Return a copy with other values, by name.
@@ -119,11 +107,7 @@ class ModelSettings(_CheckedSettings):
         Raises:
             RequestError: a name is unknown, or a value is not valid.
         """
-        defaults = {item.name: getattr(self, item.name) for item in fields(self)}
-        for name in values:
-            if name not in defaults:
-                raise RequestError(f"setting '{name}': unknown; valid: {', '.join(defaults)}")
-        return replace(self, **{k: _like(k, v, defaults[k]) for k, v in values.items()})
+        return convert(as_json(asdict(self) | dict(values)), type(self), "settings")
 
     def _require_halvings(self, side: int, channels: tuple[int, ...], least: int) -> None:
         """Check the ``channels`` of convolutions that each halve an image of ``side`` pixels."""
@@ -132,20 +116,6 @@ class ModelSettings(_CheckedSettings):
                 f"setting channels={channels}: not possible; valid: 1 or more channels for each of "
                 f"1 or more halvings of {side} pixels, which leave {least} or more"
             )
-
-
-def _like(name: str, value: Any, default: Any) -> Any:
-    """Convert ``value`` to the type of ``default``, where that changes nothing."""
-    if isinstance(default, tuple):
-        if isinstance(value, (list, tuple)) and all(type(item) is int for item in value):
-            return tuple(value)
-        raise RequestError(f"setting {name}={value}: wrong type; valid: a list of whole numbers")
-    if isinstance(default, float) and type(value) is int:
-        return float(value)
-    if type(value) is not type(default):
-        kind = type(default).__name__
-        raise RequestError(f"setting {name}={value}: wrong type; valid: {kind}, like {default}")
-    return value
 
 
 @dataclass(frozen=True)
@@ -173,15 +143,15 @@ class ApproachSettings(ModelSettings):
         "heads": 4,
     } | {"feedforward": 256, "dropout": 0.0}
 
-    size: int = field(default=256, metadata={"choices": IMAGE_SIZES})
+    size: ImageSize = 256
     channels: tuple[int, ...] = (32, 64, 128, 256, 256, 256)
-    width: int = _within(512, 2, 8192)
-    heads: int = _within(8, 1, 128)
-    layers: int = _within(4, 1, 64)
-    feedforward: int = _within(2048, 1, 65536)
-    dropout: float = _within(0.1, 0.0, 0.9)
-    history: int = _within(70, 1, 10_000)
-    horizon: int = _within(5, 1, 1000)
+    width: Annotated[int, Interval(ge=2, le=8192)] = 512
+    heads: Annotated[int, Interval(ge=1, le=128)] = 8
+    layers: Annotated[int, Interval(ge=1, le=64)] = 4
+    feedforward: Annotated[int, Interval(ge=1, le=65536)] = 2048
+    dropout: Annotated[float, Interval(ge=0.0, le=0.9)] = 0.1
+    history: Annotated[int, Interval(ge=1, le=10_000)] = 70
+    horizon: Annotated[int, Interval(ge=1, le=1000)] = 5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,8 +172,8 @@ class FusionSettings(ApproachSettings):
 
     cpu: ClassVar[Mapping[str, Any]] = {**ApproachSettings.cpu, "landmark_width": 64}
 
-    landmark_width: int = _within(256, 2, 8192)
-    landmark_weight: float = _within(0.5, 0.0, 1e6)
+    landmark_width: Annotated[int, Interval(ge=2, le=8192)] = 256
+    landmark_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -217,7 +187,7 @@ class CrossAttentionSettings(FusionSettings):
 
     cpu: ClassVar[Mapping[str, Any]] = {**FusionSettings.cpu, "attention_width": 128}
 
-    attention_width: int = _within(256, 1, 8192)
+    attention_width: Annotated[int, Interval(ge=1, le=8192)] = 256
 
 
 @dataclass(frozen=True)
@@ -250,20 +220,20 @@ class ResidualSettings(ModelSettings):
         "refiner": 12,
     }
 
-    size: int = field(default=256, metadata={"choices": IMAGE_SIZES})
-    pictures: int = _within(4, 2, 64)
-    region: int = _within(48, 8, 256)
+    size: ImageSize = 256
+    pictures: Annotated[int, Interval(ge=2, le=64)] = 4
+    region: Annotated[int, Interval(ge=8, le=256)] = 48
     channels: tuple[int, ...] = (32, 64, 128)
-    width: int = _within(128, 4, 4096)
-    refiner: int = _within(32, 1, 1024)
-    dropout: float = _within(0.2, 0.0, 0.9)
-    shapes: int = _within(8, 2, 64)
-    history: int = _within(64, 16, 10_000)
-    recent: int = _within(32, 2, 10_000)
-    horizon: int = _within(5, 1, 30)
-    mouth_weight: float = _within(1.0, 0.0, 1e6)
-    landmark_weight: float = _within(0.3, 0.0, 1e6)
-    picture_weight: float = _within(10.0, 0.0, 1e6)
+    width: Annotated[int, Interval(ge=4, le=4096)] = 128
+    refiner: Annotated[int, Interval(ge=1, le=1024)] = 32
+    dropout: Annotated[float, Interval(ge=0.0, le=0.9)] = 0.2
+    shapes: Annotated[int, Interval(ge=2, le=64)] = 8
+    history: Annotated[int, Interval(ge=16, le=10_000)] = 64
+    recent: Annotated[int, Interval(ge=2, le=10_000)] = 32
+    horizon: Annotated[int, Interval(ge=1, le=30)] = 5
+    mouth_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 1.0
+    landmark_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 0.3
+    picture_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 10.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,17 +15,11 @@ import numpy as np
 from face_prediction.tracking.geometry import continuous_quaternions, lift_landmarks, rotation_angle
 from face_prediction.tracking.tracks import FaceTrack
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import Positive, require_ranges
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
-
-
-def _require_positive(settings: object, *names: str) -> None:
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise RequestError(f"--{name} {value}: must be positive")
 
 
 @dataclass(frozen=True)
@@ -43,15 +37,15 @@ class QualityLimits:
         max_rotation: Degrees between the head and facing the camera.
     """
 
-    max_speed: float = 0.6
-    max_acceleration: float = 15.0
-    max_turn_rate: float = 400.0
-    max_jaw_speed: float = 0.6
-    depth_sigmas: float = 4.0
-    max_rotation: float = 35.0
+    max_speed: Positive = 0.6
+    max_acceleration: Positive = 15.0
+    max_turn_rate: Positive = 400.0
+    max_jaw_speed: Positive = 0.6
+    depth_sigmas: Positive = 4.0
+    max_rotation: Positive = 35.0
 
     def __post_init__(self) -> None:
-        _require_positive(self, *vars(self))
+        require_ranges(self, "--{} {}")
 
 
 @dataclass(frozen=True)
@@ -190,13 +184,13 @@ class MotionSettings:
     """
 
     limits: QualityLimits = field(default_factory=QualityLimits)
-    min_run: float = 12.0
-    max_displacement: float = 0.08
-    depth_cutoff: float | None = 3.0
-    max_depth_tremor: float = 0.001
+    min_run: Positive = 12.0
+    max_displacement: Positive = 0.08
+    depth_cutoff: Positive | None = 3.0
+    max_depth_tremor: Positive = 0.001
 
     def __post_init__(self) -> None:
-        _require_positive(self, "min_run", "max_displacement", "depth_cutoff", "max_depth_tremor")
+        require_ranges(self, "--{} {}")
 
 
 @dataclass(frozen=True)

@@ -227,7 +227,8 @@ def plot_clip(path: Path, name: str, motion: ClipMotion) -> None:
     counts.text(
         0.05, 0.95, "\n".join(lines), va="top", fontsize="small", transform=counts.transAxes
     )
-    figure.suptitle(f"{name}: {motion.seconds:.1f} s kept in {len(motion.runs)} run(s)")
+    title = f"{name}: {motion.seconds:.1f} s kept in {len(motion.runs)} run(s)"
+    figure.suptitle(title, parse_math=False)
 
     canvas.draw()
     # 64 colours are plenty for lines and halve the file

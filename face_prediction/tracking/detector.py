@@ -12,15 +12,17 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Interval
 
 from face_prediction.tracking.geometry import CENTIMETRE
 from face_prediction.tracking.tracks import NUM_LANDMARKS, Size
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import atomic_file, file_digest
+from robo_manip_baselines.runs.ranges import require_ranges
 
 logger = logging.getLogger(__name__)
 
@@ -103,18 +105,12 @@ class DetectorSettings:
     """
 
     running_mode: RunningMode = "image"
-    num_faces: int = 4
-    min_detection_confidence: float = 0.5
-    min_presence_confidence: float = 0.5
+    num_faces: Annotated[int, Interval(ge=1, le=64)] = 4
+    min_detection_confidence: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.5
+    min_presence_confidence: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.5
 
     def __post_init__(self) -> None:
-        if self.running_mode not in ("image", "video"):
-            raise RequestError(f"running_mode '{self.running_mode}'; valid: image, video")
-        if self.num_faces < 1:
-            raise RequestError(f"num_faces {self.num_faces}; at least 1")
-        for name in ("min_detection_confidence", "min_presence_confidence"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise RequestError(f"{name} {getattr(self, name)}; between 0 and 1")
+        require_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from face_prediction.tracking.detector import DetectorSettings, FaceDetection, FaceDetector
 from face_prediction.tracking.geometry import (
@@ -31,6 +32,7 @@ from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceErro
 from face_prediction.tracking.video import DECODING, VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
+from robo_manip_baselines.runs.ranges import require_ranges
 
 DEFAULT_FPS = 30.0
 """Rate of the paper's recordings (IV.B)."""
@@ -76,15 +78,12 @@ class ExtractSettings:
     """
 
     detector: DetectorSettings = field(default_factory=DetectorSettings)
-    fps: float | None = DEFAULT_FPS
-    max_gap: float = MAX_GAP
+    fps: Annotated[float, Interval(gt=0.0, le=1000.0)] | None = DEFAULT_FPS
+    max_gap: Annotated[float, Interval(ge=0.0, le=1.0)] = MAX_GAP
     zoom: bool = True
 
     def __post_init__(self) -> None:
-        if self.fps is not None and not (0.0 < self.fps <= 1000.0):
-            raise RequestError(f"--fps {self.fps}: between 0 and 1000, or None")
-        if not 0.0 <= self.max_gap <= 1.0:
-            raise RequestError(f"--max_gap {self.max_gap}: between 0 and 1 s")
+        require_ranges(self, "--{} {}")
         if self.zoom and self.detector.running_mode == "video":
             raise RequestError("--zoom works with --running_mode image only; add --no_zoom")
 

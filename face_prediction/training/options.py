@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from annotated_types import Interval
 
 from face_prediction.models.settings import (
     Decay,
@@ -16,7 +16,16 @@ from face_prediction.models.settings import (
     PredictorTrainSettings,
     preset_settings,
 )
+from robo_manip_baselines.runs.documents import parse_json
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import (
+    Amount,
+    Count,
+    Fraction,
+    NonNegativeInt,
+    Seed,
+    require_ranges,
+)
 
 
 @dataclass(frozen=True)
@@ -62,28 +71,28 @@ class FaceTrainOptions:
         Literal["image_only", "simple_fusion", "cross_attention", "residual"]
     ]
     dataset: Path = Path("face_dataset")
-    test_fold: int | None = 0
+    test_fold: NonNegativeInt | None = 0
     hold_out: Literal["next", "none"] = "next"
     preset: Literal["paper", "cpu"] = "cpu"
     out: Path | None = None
-    seed: int = 0
-    subjects: int | None = None
+    seed: Seed = 0
+    subjects: Count | None = None
     settings: tuple[str, ...] = ()
-    steps: int | None = None
-    batch_size: int | None = None
-    learning_rate: float | None = None
+    steps: Count | None = None
+    batch_size: Count | None = None
+    learning_rate: Amount | None = None
     schedule: Decay | None = None
-    warmup_steps: int | None = None
-    clip_norm: float | None = None
-    ema_decay: float | None = None
+    warmup_steps: NonNegativeInt | None = None
+    clip_norm: Amount | None = None
+    ema_decay: Fraction | None = None
     augment: bool | None = None
     precision: Precision | None = None
-    validate_every: int | None = None
-    validation_sequences: int | None = None
+    validate_every: Count | None = None
+    validation_sequences: NonNegativeInt | None = None
     device: str = "auto"
-    memory_gb: float = 6.0
-    log_every: int = 20
-    checkpoint_every: int = 200
+    memory_gb: Annotated[float, Interval(ge=0.0, le=1e6)] = 6.0
+    log_every: Count = 20
+    checkpoint_every: Count = 200
     progress: bool = True
 
     @property
@@ -99,11 +108,7 @@ class FaceTrainOptions:
         Raises:
             RequestError: an option is not valid, or a setting is none of this network's.
         """
-        at_least = {"seed": 0, "memory_gb": 0, "log_every": 1, "checkpoint_every": 1}
-        for name, least in at_least.items():
-            value = getattr(self, name)
-            if not value >= least:  # NaN is not
-                raise RequestError(f"--{name} {value}: too small; valid: {least} or more")
+        require_ranges(self, "--{} {}")
         model, training = preset_settings(self.model, self.preset)
         given = {x.name: getattr(self, x.name) for x in fields(training)}
         given = {name: value for name, value in given.items() if value is not None}
@@ -117,7 +122,7 @@ def _parsed(settings: tuple[str, ...]) -> dict[str, Any]:
         if not equals:
             raise RequestError(f"--settings {text}: no value; valid: NAME=VALUE, like width=96")
         try:
-            values[name] = json.loads(value)
-        except ValueError:
+            values[name] = parse_json(value, f"--settings {name}")
+        except RequestError:
             values[name] = value
     return values

@@ -29,10 +29,10 @@ from face_prediction.models.interface import PredictorModel
 from face_prediction.models.learned import (
     MODEL_FILE,
     CheckpointRecord,
+    FoldUses,
     load_tensors,
     read_predictor_checkpoint,
     read_tensors,
-    require_kind,
     save_predictor_checkpoint,
     write_tensors,
 )
@@ -40,6 +40,7 @@ from face_prediction.models.settings import PredictorTrainSettings, make_predict
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import SequenceWindows, WindowBatch, augment, window_batches
+from robo_manip_baselines.runs.documents import Schema, convert
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
     FolderKind,
@@ -51,10 +52,11 @@ from robo_manip_baselines.runs.files import (
 from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
+from robo_manip_baselines.runs.ranges import Amount, NonNegativeInt
 from robo_manip_baselines.runs.seeds import stream_generator
 from robo_manip_baselines.runs.versions import software_versions
 
-KIND = {"schema": "face_trainer", "version": 1}
+SCHEMA = Schema("face_trainer", 1)
 TRAINER_FILE = "trainer.safetensors"
 METRICS_FILE = "metrics.jsonl"
 CURVES = {
@@ -151,7 +153,7 @@ class People:
 
     train: NDArray[np.int64]
     validation: NDArray[np.int64]
-    folds: dict[str, list[int]]
+    folds: FoldUses
     train_subjects: list[str]
 
 
@@ -185,7 +187,7 @@ def choose_people(dataset: FaceDataset, options: FaceTrainOptions) -> People:
         order = stream_generator(options.seed, "subjects").permutation(len(names))
         names = sorted(names[place] for place in order[:subjects])
         rows = rows[[owner in names for owner in owners]]
-    folds = {"train": list(train), "validation": list(validation), "test": list(test)}
+    folds = FoldUses(train=list(train), validation=list(validation), test=list(test))
     return People(rows, dataset.indices(folds=validation), folds, names)
 
 
@@ -214,8 +216,8 @@ class TrainerProgress:
         best: their losses and errors on it.
     """
 
-    step: int = 0
-    seconds: float = 0.0
+    step: NonNegativeInt = 0
+    seconds: Amount = 0.0
     names: list[str] = field(default_factory=list)
     rows: list[list[float]] = field(default_factory=list)
     best_step: int | None = None
@@ -230,7 +232,7 @@ class TrainerProgress:
 def _is_run(folder: Path) -> bool:
     path = folder / TRAINER_FILE
     if path.exists():
-        require_kind(path, read_tensors(path)[1], KIND)
+        SCHEMA.without(read_tensors(path)[1], f"'{path}'")
     # a network without the state of its trainer is refused later, with its reason
     return path.exists() or (folder / MODEL_FILE).exists()
 
@@ -259,20 +261,28 @@ def _previous_state(
         (folder / METRICS_FILE).unlink(missing_ok=True)
         return None
     tensors, state, _ = read_tensors(path)
-    require_kind(path, state, KIND)
-    for name, old, new in _differences(state["run"], _run_record(record)):
+    stored = convert(SCHEMA.without(state, f"'{path}'"), StoredTrainer, f"'{path}'")
+    for name, old, new in _differences(stored.run, _run_record(record)):
         if name != EXTENDABLE:
             raise RequestError(
                 f"--out {folder}: holds a run with {name} {old}, not {new}; "
                 "choose another folder, or give the same options"
             )
-    progress = TrainerProgress(**state["progress"])
+    progress = stored.progress
     if progress.step > record.training["steps"]:
         raise RequestError(
             f"--out {folder}: has done {progress.step} steps already, more than --steps "
             f"{record.training['steps']}; give a larger number to extend the run"
         )
     return tensors, progress
+
+
+@dataclass(frozen=True)
+class StoredTrainer:
+    """Record of ``trainer.safetensors``: what is trained, and how far."""
+
+    run: dict[str, Any]
+    progress: TrainerProgress
 
 
 def _run_record(record: CheckpointRecord) -> dict[str, Any]:
@@ -511,7 +521,11 @@ class PredictorTrainer:
         for name, parameter in self._model.named_parameters():
             parts[f"adam/{name}/"] = self._optimizer.state.get(parameter, {})
         tensors = {f"{prefix}{k}": v for prefix, part in parts.items() for k, v in part.items()}
-        record = {**KIND, "run": _run_record(self._record), "progress": asdict(progress)}
+        record = {
+            **SCHEMA.to_json(),
+            "run": _run_record(self._record),
+            "progress": asdict(progress),
+        }
         write_tensors(folder / TRAINER_FILE, tensors, record)
         self._saved_step = progress.step
         if self._validation is None or progress.best_step is not None:

@@ -33,11 +33,11 @@ from robo_manip_baselines.benchmark.work_item import (
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.rollout.results import RESULTS, read_results
+from robo_manip_baselines.runs.documents import read_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
     FolderKind,
     locked_file,
-    read_json,
     write_json,
     write_text,
 )

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import logging
 import re
-import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Len
 
 from robo_manip_baselines.benchmark.forecasts import FORECASTS
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.policy.registry import policy_entry
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.documents import convert, load_yaml, shortened
+from robo_manip_baselines.runs.errors import RequestError, require_choice, require_printable
 
 CONDITIONS = Path(str(files("robo_manip_baselines.benchmark") / "conditions"))
 """Folder of the files that ship with the package; a benchmark is named after its file."""
@@ -29,8 +31,7 @@ PUBLISHED = "published"
 """In place of a list of names: the conditions whose results the task's paper reports."""
 
 _DEFAULT_SPEC = ObservationSpec("current_pred", cameras=())
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-_TYPE_NAMES = {str: "text", int: "a whole number", float: "a number"}
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 
 logger = logging.getLogger(__name__)
 
@@ -69,6 +70,7 @@ class ConditionConfig:
                 f"name '{self.name}': must be letters, digits, '_', '-' and '.', for example "
                 "current_pred_h2_delay3"
             )
+        require_printable("title", self.title)
         policy_entry(self.policy)
         require_choice("prediction", self.prediction, ("truth", *FORECASTS))
         motion = parse_motion(self.motion)
@@ -96,22 +98,19 @@ class ConditionConfig:
         Raises:
             RequestError: a key or a value is not valid.
         """
-        if not isinstance(values, dict):
-            raise RequestError("a condition is a mapping such as {name: current, obs: current}")
         given: dict[type, dict[str, Any]] = {cls: {}, ObservationSpec: {}, Corruption: {}}
-        for key, value in values.items():
-            owner, name, kind = _KEYS[require_choice("key of a condition", str(key), _KEYS)]
+        for key, value in convert(values, dict, "a condition").items():
+            owner, name = _KEYS[require_choice("key of a condition", key, _KEYS)]
             if name == "motion":
                 value = str(parse_motion(value))
-            accepted = (int, float) if kind is float else kind
-            if not isinstance(value, accepted) or isinstance(value, bool):
-                raise RequestError(f"{key} must be {_TYPE_NAMES[kind]}, not {value!r}")
             given[owner][name] = value
-        if "name" not in values:
+        if "name" not in given[cls]:
             raise RequestError("the condition has no name; add 'name: ...'")
-        corruption = Corruption(**given[Corruption])
-        spec = replace(_DEFAULT_SPEC, **given[ObservationSpec], corruption=corruption)
-        return cls(**given[cls], spec=spec)
+        settings = {**_DEFAULT_SPEC.to_json(), **given[ObservationSpec]}
+        settings["corruption"] = given[Corruption]
+        return replace(
+            convert(given[cls], cls, "condition"), spec=ObservationSpec.from_json(settings)
+        )
 
     def for_task(self, task: TaskEntry) -> ConditionConfig:
         """Return the condition with the task's default expert, if none is given.
@@ -141,26 +140,39 @@ class ConditionConfig:
 
 
 _NOT_OF_A_CONDITION = (
-    *("cameras", "image_size", "render_size", "object_pose", "arms", "corruption"),  # of the preset
+    # Of the preset:
+    *("spec", "cameras", "image_size", "render_size", "object_pose", "arms", "corruption"),
     *("error_stats", "stats_sha256"),  # one file for all conditions
 )
 
 
-def _find_keys() -> dict[str, tuple[type, str, type]]:
-    """Map each key of an entry to its class, its field and the type of its value."""
-    keys: dict[str, tuple[type, str, type]] = {}
+def _find_keys() -> dict[str, tuple[type, str]]:
+    """Map each key of an entry to its class and its field."""
+    keys: dict[str, tuple[type, str]] = {}
     for owner in (ConditionConfig, ObservationSpec, Corruption):
-        hints = typing.get_type_hints(owner)
         for name in (item.name for item in fields(owner)):
             key = "corruption_seed" if (owner, name) == (Corruption, "seed") else name
-            accepted = (hints[name], *typing.get_args(hints[name]))
-            kinds = [kind for kind in _TYPE_NAMES if kind in accepted]
-            if kinds and name not in _NOT_OF_A_CONDITION:
-                keys[key] = owner, name, kinds[0]
+            if name not in _NOT_OF_A_CONDITION:
+                keys[key] = owner, name
     return keys
 
 
 _KEYS = _find_keys()
+
+
+@dataclass(frozen=True)
+class ConditionsDocument:
+    """Content of a file of conditions.
+
+    Attributes:
+        conditions: entries, see `ConditionConfig.from_yaml`.
+        env: name of the task.
+        presets: name of a preset -> names of its conditions, or ``published``.
+    """
+
+    conditions: Annotated[tuple[Any, ...], Len(1, 1000)]
+    env: str = "FeedingEnv"
+    presets: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -194,34 +206,21 @@ def read_conditions(path: Path) -> ConditionFile:
     Raises:
         RequestError: the file cannot be read, or an entry is not valid; the message names its line.
     """
-    import yaml  # slow to import
-
-    try:
-        text = path.read_text(encoding="utf-8")
-        content, node = yaml.safe_load(text), yaml.compose(text, yaml.SafeLoader)
-    except OSError as error:
-        raise RequestError(f"cannot read '{path}': {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RequestError(f"'{path}' is no YAML: {error}") from error
+    content, lines = load_yaml(path)
     key = "conditions"
     if isinstance(content, dict) and "arms" in content and key not in content:
-        key = "arms"
+        content = {key if name == "arms" else name: value for name, value in content.items()}
+        lines = {
+            (key, *place[1:]) if place[:1] == ("arms",) else place: n for place, n in lines.items()
+        }
         logger.info("'%s': 'arms:' is called 'conditions:' now; both are read", path)
-    if not isinstance(content, dict) or not isinstance(content.get(key), list):
-        raise RequestError(f"'{path}' must hold 'env: FeedingEnv' and a list 'conditions:'")
-    if not content[key]:
-        raise RequestError(
-            f"'{path}' has no conditions; give a line such as '- {{name: current, ...}}'"
-        )
-    (entries,) = (value.value for name, value in node.value if name.value == key)
+    document = convert(content, ConditionsDocument, f"'{path}'", lines)
     place = ""
     conditions: list[ConditionConfig] = []
     try:
-        for name in content:
-            require_choice("entry", str(name), ("env", key, "presets"))
-        task = task_entry(str(content.get("env", "FeedingEnv")))
-        for entry, values in zip(entries, content[key], strict=True):
-            place = f", line {entry.start_mark.line + 1}"
+        task = task_entry(document.env)
+        for number, values in enumerate(document.conditions):
+            place = f", line {lines[key, number]}"
             condition = ConditionConfig.from_yaml(values).for_task(task)
             if condition.name in [other.name for other in conditions]:
                 raise RequestError(
@@ -229,16 +228,16 @@ def read_conditions(path: Path) -> ConditionFile:
                 )
             conditions.append(condition)
         place = ""
-        presets = content.get("presets", {})
-        if not isinstance(presets, dict) or not all(
-            names == PUBLISHED or isinstance(names, list) for names in presets.values()
-        ):
-            raise RequestError(f"presets map names of presets to '{PUBLISHED}', or a list of names")
-        published = task.load_study().published
+        published = tuple(task.load_study().published)
         file = ConditionFile(
             task.name,
             tuple(conditions),
-            {k: tuple(published if v == PUBLISHED else v) for k, v in presets.items()},
+            {
+                name: published
+                if names == PUBLISHED
+                else convert(names, tuple[str, ...], f"presets.{shortened(name)}")
+                for name, names in document.presets.items()
+            },
         )
         for names in file.presets.values():
             file.choose(names)

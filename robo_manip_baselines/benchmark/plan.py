@@ -21,6 +21,7 @@ from robo_manip_baselines.rollout.demonstrate import Collection
 from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import Amount, Count, Episodes, require_ranges
 from robo_manip_baselines.training.config import TrainConfig
 
 _FUNCTIONS = "robo_manip_baselines.benchmark.worker"
@@ -57,24 +58,22 @@ class BenchmarkPreset:
 
     train_preset: str
     cameras: tuple[str, ...]
-    demonstrations: int
-    demonstration_block: int
-    num_episodes: int
-    episode_block: int
-    train_seeds: int = 1
+    demonstrations: Episodes
+    demonstration_block: Episodes
+    num_episodes: Episodes
+    episode_block: Episodes
+    train_seeds: Count = 1
     train_settings: Mapping[str, Any] = field(default_factory=dict)
-    num_envs: int = 8
+    num_envs: Count = 8
     device: str = "cpu"
-    threads: int = 1
-    gpu_share: float = 0.0
+    threads: Count = 1
+    gpu_share: Amount = 0.0
     caution: str = ""
     has_videos: bool = True
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("demonstrations", "num_episodes", "train_seeds"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} {getattr(self, name)}: must be 1 or more")
+        require_ranges(self)
 
 
 PRESETS: dict[str, BenchmarkPreset] = {

@@ -13,17 +13,20 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+from typing_extensions import TypedDict
+
+from robo_manip_baselines.runs.documents import read_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
     atomic_file,
     file_digest,
-    read_json,
     write_json,
     write_text,
 )
+from robo_manip_baselines.runs.ranges import Amount, Count
 from robo_manip_baselines.runs.versions import software_versions, source_digest
 
 ITEMS = "items"
@@ -125,7 +128,7 @@ class ArtifactStore:
         """Return the folder of an item."""
         return self.root / item.folder
 
-    def manifest(self, item: WorkItem) -> dict[str, Any] | None:
+    def manifest(self, item: WorkItem) -> ItemManifest | None:
         """Return the manifest of an item; None where it is not done."""
         return read_manifest(self.folder(item), item.key)
 
@@ -170,14 +173,39 @@ class ArtifactStore:
         write_manifest(folder, item.to_json(), sorted(files), seconds)
 
 
-def read_manifest(folder: Path, key: str) -> dict[str, Any] | None:
+class ItemManifest(TypedDict):
+    """Content of ``item.json``: the request to the process, see `WorkItem`, and what it made.
+
+    Attributes:
+        source: digest of the package's files.
+        files: outputs, paths below ``out/``.
+        seconds: that it took.
+    """
+
+    key: str
+    kind: str
+    name: str
+    function: str
+    settings: dict[str, Any]
+    needs: list[str]
+    inputs: dict[str, str]
+    threads: Count
+    versions: dict[str, str]
+    source: str
+    files: list[str]
+    seconds: Amount
+
+
+def read_manifest(folder: Path, key: str) -> ItemManifest | None:
     """Read the manifest of a folder; None unless it is of this key and its files are there."""
     try:
-        manifest = read_json(folder / MANIFEST)
+        manifest = read_json(folder / MANIFEST, ItemManifest)
     except RequestError:
         return None
-    is_whole = manifest.get("key") == key and all(
-        (folder / OUT / name).is_file() for name in manifest.get("files", [""])
+    names = [PurePosixPath(name) for name in manifest["files"]]
+    is_whole = manifest["key"] == key and all(
+        ".." not in name.parts and not name.is_absolute() and (folder / OUT / name).is_file()
+        for name in names
     )
     return manifest if is_whole else None
 

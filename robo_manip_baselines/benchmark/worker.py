@@ -32,6 +32,7 @@ from robo_manip_baselines.benchmark.work_item import (
 from robo_manip_baselines.data.files import seed_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.documents import parse_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest, locked
 from robo_manip_baselines.runs.versions import source_digest
@@ -152,7 +153,7 @@ def main() -> int:
         line = stdin.readline()
     if not line:
         _end()
-    request = json.loads(line)
+    request = parse_json(line.decode(), "request")
     threading.Thread(target=_end_with_stdin, daemon=True).start()
     _require_same_software(request)
     folder = Path.cwd()

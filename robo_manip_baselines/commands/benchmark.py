@@ -12,8 +12,10 @@ from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import tyro
+from annotated_types import Interval
 
 from robo_manip_baselines.benchmark.aggregation import (
     BENCHMARK,
@@ -44,6 +46,7 @@ from robo_manip_baselines.runs.command import EXIT_FAILED, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, require_out_folder
 from robo_manip_baselines.runs.progress import closing_table, duration
+from robo_manip_baselines.runs.ranges import Episodes, require_ranges
 from robo_manip_baselines.runs.versions import source_digest
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
@@ -93,14 +96,14 @@ class BenchmarkOptions:
     preset: str = "cpu"
     conditions: tuple[str, ...] = ()
     conditions_file: Path | None = None
-    train_seeds: int | None = None
-    num_episodes: int | None = None
+    train_seeds: Annotated[int, Interval(ge=1, le=1000)] | None = None
+    num_episodes: Episodes | None = None
     motion_library: Path | None = None
     error_stats: Path | None = None
     reference: str | None = None
     executor: str = "local"
     address: str | None = None
-    num_workers: int | None = None
+    num_workers: Annotated[int, Interval(ge=1, le=1024)] | None = None
     out: Path | None = None
     shard: str | None = None
     videos: bool = True
@@ -112,8 +115,7 @@ class BenchmarkOptions:
             require_choice("benchmark", self.benchmark, shipped)
         require_choice("preset", self.preset, PRESETS)
         require_choice("executor", self.executor, EXECUTORS)
-        if self.num_workers is not None and self.num_workers < 1:
-            raise RequestError(f"num_workers {self.num_workers}: must be 1 or more")
+        require_ranges(self)
         if self.executor == "ray" and self.num_workers is not None:
             raise RequestError("--num_workers goes with --executor local; Ray counts its own cores")
         if self.executor != "ray" and self.address is not None:

@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from annotated_types import Interval
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
+from robo_manip_baselines.policy.presets import Chunk
 from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import require_out_file
 from robo_manip_baselines.runs.progress import closing_table
+from robo_manip_baselines.runs.ranges import Episodes, NonNegativeInt, Processes, Quality, Seed
 from robo_manip_baselines.runs.videos import VIDEO
 
 if TYPE_CHECKING:
@@ -58,8 +61,8 @@ class ScriptedOptions:
 
     expert: str | None = None
     image_codec: str = "jpeg"
-    image_quality: int = 90
-    preview: int = 2
+    image_quality: Quality = 90
+    preview: NonNegativeInt = 2
 
 
 @dataclass(frozen=True)
@@ -80,12 +83,12 @@ class PolicyOptions:
     """
 
     checkpoint: Path | None = None
-    num_envs: int = 8
+    num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
     temporal_ensemble: bool = False
-    n_action_steps: Annotated[int | None, tyro.conf.arg(aliases=["--execute"])] = None
+    n_action_steps: Annotated[Chunk | None, tyro.conf.arg(aliases=["--execute"])] = None
     device: str = "auto"
     precision: str = "fp32"
-    video: int = 0
+    video: NonNegativeInt = 0
     change_corruption: bool = False
 
 
@@ -118,14 +121,14 @@ class RolloutOptions:
     env: tyro.conf.Positional[str]
     scripted: bool = False
     policy: str | None = None
-    num_episodes: int = 50
-    seed: int | None = None
+    num_episodes: Episodes = 50
+    seed: Seed | None = None
     out: Path | None = None
     face_motion: str | None = None
     motion: str | None = None
     clips: tuple[str, ...] = ()
     motion_library: Path | None = None
-    workers: int = 2
+    workers: Processes = 2
     spec: tyro.conf.OmitArgPrefixes[ObservationSpec] = field(default_factory=lambda: UNTRAINED)
     corruption: bool = True
     demonstration: tyro.conf.OmitArgPrefixes[ScriptedOptions] = field(
@@ -231,8 +234,6 @@ def record(options: RolloutOptions) -> None:
     from robo_manip_baselines.rollout.videos import write_preview
 
     shown, collection = options.demonstration.preview, to_collection(options)
-    if shown < 0:
-        raise RequestError(f"preview {shown}: must be 0 or more episodes")
     if shown and not options.spec.cameras and (problem := opengl_problem()):
         logger.warning("no preview video: %s", problem)
         shown = 0

@@ -17,6 +17,7 @@ from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.registry import policy_names, policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.command import last_value, parse
+from robo_manip_baselines.runs.documents import shown
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import require_out_folder
 from robo_manip_baselines.runs.metrics import read_metrics
@@ -66,7 +67,7 @@ def parse_config(args: Sequence[str], has_gpu: bool | None = None) -> TrainConfi
     file = _yaml_file(args)
     values = read_config(file) if file else {}
     if values.setdefault("policy", policy) != policy:
-        raise RequestError(f"'{file}' is of policy {values['policy']}, not {policy}")
+        raise RequestError(f"'{file}' is of policy {shown(values['policy'])}, not '{policy}'")
     env = last_value(args, "env") or str(values.get("env", TrainConfig.env))
     preset = last_value(args, "preset") or str(values.get("preset", "auto"))
     if preset == "auto":

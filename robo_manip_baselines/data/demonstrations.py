@@ -25,7 +25,9 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import ObservationSpec, State
 from robo_manip_baselines.observation.corruption import NO_PREDICTION
 from robo_manip_baselines.observation.spec import size_text
+from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import Seed
 
 
 def recorded_state(episode: EpisodeReader) -> State:
@@ -60,8 +62,12 @@ class Split:
         validation: seeds of the episodes held out, ascending; perhaps none.
     """
 
-    train: tuple[int, ...]
-    validation: tuple[int, ...]
+    train: tuple[Seed, ...]
+    validation: tuple[Seed, ...]
+
+    def __post_init__(self) -> None:
+        if not self.train or set(self.train) & set(self.validation):
+            raise RequestError("a split needs at least one training seed, and none in both parts")
 
     def to_json(self) -> dict[str, list[int]]:
         """Return what `from_json` takes, made of plain lists."""
@@ -74,16 +80,7 @@ class Split:
         Raises:
             RequestError: ``data`` is no split.
         """
-        parts: list[tuple[int, ...]] = []
-        for name in ("train", "validation"):
-            seeds = data.get(name) if isinstance(data, dict) else None
-            if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
-                raise RequestError(f"a split needs '{name}', a list of seeds, not {seeds!r}")
-            parts.append(tuple(seeds))
-        train, validation = parts
-        if not train or set(train) & set(validation):
-            raise RequestError("a split needs at least one training seed, and none in both parts")
-        return cls(train, validation)
+        return convert(data, cls, "split")
 
 
 def split_episodes(seeds: Iterable[int], fraction: float, seed: int) -> Split:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
+from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError
 
 Vector = NDArray[np.float32]
@@ -56,22 +58,36 @@ class Normalization:
         return {field.name: getattr(self, field.name).tolist() for field in fields(self)}
 
     @classmethod
-    def from_json(cls, data: Any) -> Normalization:
-        """Undo `to_json`.
+    def from_json(cls, data: Any, source: str = "statistics") -> Normalization:
+        """Undo `to_json`; ``source`` begins messages.
 
         Raises:
             RequestError: ``data`` is no normalisation: something is missing, not finite, of
                 another length, or a divisor is 0 or less.
         """
-        vectors = {field.name: _vector(data, field.name) for field in fields(cls)}
+        stored = convert(data, StoredNormalization, source)
+        return cls(**{name: np.array(value, np.float32) for name, value in vars(stored).items()})
+
+
+_LARGEST = float(np.finfo(np.float32).max)
+_Offset = Annotated[float, Interval(ge=-_LARGEST, le=_LARGEST)]
+_Scale = Annotated[float, Interval(ge=1e-38, le=_LARGEST)]
+
+
+@dataclass(frozen=True)
+class StoredNormalization:
+    """Content of ``stats.json``: the vectors of `Normalization`, within the range of float32."""
+
+    state_mean: tuple[_Offset, ...]
+    state_std: tuple[_Scale, ...]
+    action_mean: tuple[_Offset, ...]
+    action_std: tuple[_Scale, ...]
+
+    def __post_init__(self) -> None:
         for kind in ("state", "action"):
-            mean, std = vectors[f"{kind}_mean"], vectors[f"{kind}_std"]
+            mean, std = getattr(self, f"{kind}_mean"), getattr(self, f"{kind}_std")
             if len(mean) != len(std):
-                given = f"{len(mean)} of '{kind}_mean', {len(std)} of its std"
-                raise RequestError(f"statistics: {given}")
-            if not (std > 0.0).all():
-                raise RequestError(f"statistics: '{kind}_std' must be more than 0 everywhere")
-        return cls(**vectors)
+                raise RequestError(f"{len(mean)} of '{kind}_mean', {len(std)} of its std")
 
 
 def mean_std(state: Vector, action: Vector) -> Normalization:
@@ -107,14 +123,3 @@ METHODS: dict[str, Callable[[Vector, Vector], Normalization]] = {
     "min_max": min_max,
     "none": no_normalization,
 }
-
-
-def _vector(data: Any, name: str) -> Vector:
-    numbers = data.get(name) if isinstance(data, dict) else None
-    # A bool is an int to Python, but no statistic.
-    if not isinstance(numbers, list) or not all(type(x) in (int, float) for x in numbers):
-        raise RequestError(f"statistics: '{name}' is missing, or no list of numbers")
-    vector = np.array(numbers, dtype=np.float32)
-    if not np.isfinite(vector).all():
-        raise RequestError(f"statistics: '{name}' is not finite everywhere")
-    return vector

@@ -27,8 +27,9 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     env_kwargs_problem,
 )
 from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.runs.documents import parse_json
 from robo_manip_baselines.runs.images import CODECS, MAX_SIDE
-from robo_manip_baselines.runs.npz import add_array, parse_json
+from robo_manip_baselines.runs.npz import add_array
 
 SCHEMA = "robo_manip_baselines/episode"
 SCHEMA_VERSION = 3

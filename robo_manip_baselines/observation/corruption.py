@@ -6,7 +6,6 @@ video frames, J detections at the detector's own rate, ... any shape of times.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -14,12 +13,20 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from annotated_types import Interval
 from numpy.typing import ArrayLike, NDArray
 
 from robo_manip_baselines.observation.error_models import DRAWN_ERRORS, WORLD_FROM_IMAGE, Draw
 from robo_manip_baselines.observation.error_stats import load_error_stats
 from robo_manip_baselines.observation.state import FRAME_RATE, Floats, State, TargetObservation
-from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
+from robo_manip_baselines.runs.documents import convert
+from robo_manip_baselines.runs.errors import (
+    RequestError,
+    require_choice,
+    require_integer,
+    require_printable,
+)
+from robo_manip_baselines.runs.ranges import MAX_SEED, Fraction, Seed, require_ranges
 
 MEASURED_ERRORS = tuple(DRAWN_ERRORS)
 """Errors of the forecast that are drawn from the statistics of a file."""
@@ -27,14 +34,11 @@ MEASURED_ERRORS = tuple(DRAWN_ERRORS)
 ERRORS = ("none", *MEASURED_ERRORS, "model")
 """Errors of the forecast; ``model`` is the recorded output of a trained predictor."""
 
+MAX_DELAY = 900
+"""Frames, half a minute: longer than any episode."""
+
 DROPOUT_LENGTH = 15.0
 """Default mean length of a loss of the face, frames: half a second."""
-
-MAX_DELAY = 10_000
-"""Frames, far longer than any episode."""
-
-MAX_SEED = 2**63 - 1
-"""Largest seed: the largest integer that an episode file holds."""
 
 NO_PREDICTION = (
     "no predicted mouth, which the error 'model' shows; use a motion library that "
@@ -79,11 +83,11 @@ class Corruption:
     error: str = "none"
     error_stats: str | None = None
     stats_sha256: tyro.conf.Suppress[str | None] = None
-    delay: int = 0
-    face_dropout: float = 0.0
-    face_dropout_length: float = DROPOUT_LENGTH
-    detector_rate: float | None = None
-    seed: Annotated[int, tyro.conf.arg(name="corruption_seed")] = 0
+    delay: Annotated[int, Interval(ge=0, le=MAX_DELAY)] = 0
+    face_dropout: Fraction = 0.0
+    face_dropout_length: Annotated[float, Interval(ge=1.0, le=1e6)] = DROPOUT_LENGTH
+    detector_rate: Annotated[float, Interval(gt=0.0, le=FRAME_RATE)] | None = None
+    seed: Annotated[Seed, tyro.conf.arg(name="corruption_seed")] = 0
 
     def __post_init__(self) -> None:
         require_choice("error model", self.error, ERRORS)
@@ -94,28 +98,23 @@ class Corruption:
             )
         if not isinstance(self.error_stats, str | None):
             raise RequestError(f"error_stats {self.error_stats!r}: must be the path of a file")
+        if self.error_stats is not None:
+            require_printable("error_stats", self.error_stats, 4096)
         require_integer("delay", self.delay, 0, MAX_DELAY, " frames of 1/30 s")
+        require_integer("corruption_seed", self.seed, 0, MAX_SEED)
         for name in ("face_dropout", "face_dropout_length", "detector_rate"):
             value = getattr(self, name)
             if not (_is_number(value) or (name == "detector_rate" and value is None)):
                 raise RequestError(f"{name} {value!r}: must be a number")
+        require_ranges(self)
         length = self.face_dropout_length
-        if not (math.isfinite(length) and length >= 1.0):
-            raise RequestError(f"face_dropout_length {length:g}: must be 1 or more frames")
         # Losses of that length, however close together, leave at least one frame between them.
         most = length / (length + 1.0)
-        if not 0.0 <= self.face_dropout <= most:
+        if self.face_dropout > most:
             raise RequestError(
                 f"face_dropout {self.face_dropout:g}: must be 0 to {most:.3g}, the share of frames "
                 f"in which the face is lost, with losses of {length:g} frames"
             )
-        rate = self.detector_rate
-        if rate is not None and not 0.0 < rate <= FRAME_RATE:
-            raise RequestError(
-                f"detector_rate {rate:g}: must be above 0 and at most {FRAME_RATE:g} Hz, the "
-                "camera's; leave it out for a detection at every step"
-            )
-        require_integer("seed of the corruption", self.seed, 0, MAX_SEED)
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Corruption:
@@ -124,10 +123,7 @@ class Corruption:
         Raises:
             RequestError: a value or a name is not valid.
         """
-        names = [field.name for field in fields(cls)]
-        for name in values:
-            require_choice("setting of the corruption", name, names)
-        return cls(**values)
+        return convert(dict(values), cls, "corruption")
 
     def __bool__(self) -> bool:
         """Return whether anything is corrupted."""

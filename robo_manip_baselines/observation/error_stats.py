@@ -7,19 +7,28 @@ image.
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Interval, Len
 
 from robo_manip_baselines.observation.state import Floats
+from robo_manip_baselines.runs.documents import (
+    IGNORES_OTHERS,
+    Schema,
+    convert,
+    parse_json_bytes,
+    read_bytes,
+)
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import Amount
 
-SCHEMA = "error_stats"
-VERSION = 1
+SCHEMA = Schema("error_stats", 1)
+MAX_BYTES = 64 << 20
+"""Size of a file: hours of residuals."""
+
 DEFAULT_STATS = Path(__file__).with_name("assets") / "error_stats.json"
 
 
@@ -67,79 +76,115 @@ def load_error_stats(path: str | Path | None = None, sha256: str | None = None) 
     """
     source = DEFAULT_STATS if path is None else Path(path)
     remedy = "make one with 'python -m face_prediction export-stats' or leave error_stats out"
+    first = f"error statistics '{source}'"
     try:
-        content = source.read_bytes()
-    except OSError as error:
-        reason = f"cannot be read: {error.strerror or error}"
-        raise RequestError(f"error statistics '{source}' {reason}; {remedy}") from error
+        content = read_bytes(source, MAX_BYTES)
+    except RequestError as error:
+        raise RequestError(f"error statistics: {error}; {remedy}") from error
     digest = hashlib.sha256(content).hexdigest()
     if sha256 not in (None, digest):
         raise RequestError(
-            f"error statistics '{source}' are not those that were used before (SHA-256 "
-            f"{digest[:12]}, not {str(sha256)[:12]}); give the file that was, as error_stats"
+            f"{first} are not those that were used before (SHA-256 {digest[:12]}, not "
+            f"{str(sha256)[:12]}); give the file that was, as error_stats"
         )
     try:
-        stored = json.loads(content)
-        kind = (stored.get("schema"), stored.get("version")) if isinstance(stored, dict) else None
-        if kind != (SCHEMA, VERSION):
-            raise ValueError(f"it is not '{SCHEMA}' of version {VERSION}")
-        return _from_json(stored, source, digest)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        what = f"'{error.args[0]}' is missing" if isinstance(error, KeyError) else str(error)
-        raise RequestError(f"error statistics '{source}' are damaged: {what}; {remedy}") from error
+        rest = SCHEMA.without(parse_json_bytes(content, first, MAX_BYTES), first)
+        return _from_document(convert(rest, StoredErrorStats, first), source, digest)
+    except RequestError as error:
+        raise RequestError(f"{error}; {remedy}") from error
 
 
-def _from_json(stored: Mapping[str, Any], source: Path, digest: str) -> ErrorStats:
-    fps, stride = float(stored["fps"]), int(stored["stride_frames"])
-    if fps != 30.0 or stride < 1:
-        raise ValueError(f"fps {fps:g} and stride_frames {stride} must be 30 and 1 or more")
-    rows = stored["horizons"]
-    size = len(rows)
-    if size == 0 or [row["frames"] for row in rows] != list(range(1, size + 1)):
-        raise ValueError("'horizons' must be 1, 2, ... frames ahead")
-    scale = _metres(stored["camera"])
-    both = np.tile(scale, size)
-    covariance = _array(stored["covariance"], "covariance", (2 * size, 2 * size))
-    least = np.linalg.eigvalsh((covariance + covariance.T) / 2)[0]
-    if not np.array_equal(covariance, covariance.T) or least < -1e-6 * np.trace(covariance):
-        raise ValueError("'covariance' must be symmetric without negative eigenvalues")
-    mean_abs = _array([row["mean_abs_m"] for row in rows], "mean_abs_m", (size, 2))
-    if (mean_abs < 0).any():
-        raise ValueError("'mean_abs_m' must not be negative")
+_Pair = tuple[float, float]
+_Length = Annotated[float, Interval(gt=0.0, le=1e6)]
+
+
+@dataclass(frozen=True)
+class StoredCamera:
+    """Camera that errors are converted to metres for: degrees, m, and shares of its image."""
+
+    __pydantic_config__: ClassVar = IGNORES_OTHERS
+
+    fov_x_deg: Annotated[float, Interval(gt=0.0, lt=180.0)]
+    fov_y_deg: Annotated[float, Interval(gt=0.0, lt=180.0)]
+    depth_m: _Length
+    crop_width: _Length
+    crop_height: _Length
+
+
+@dataclass(frozen=True)
+class StoredHorizon:
+    """Errors of one forecast frame."""
+
+    __pydantic_config__: ClassVar = IGNORES_OTHERS
+
+    frames: int
+    bias: _Pair
+    mean_abs_m: tuple[Amount, Amount]
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """(n, H, 2) errors of successive forecasts."""
+
+    __pydantic_config__: ClassVar = IGNORES_OTHERS
+
+    values: Annotated[tuple[tuple[_Pair, ...], ...], Len(1)]
+
+
+@dataclass(frozen=True)
+class StoredErrorStats:
+    """Part of ``error_stats.json`` that errors are drawn from; see `ErrorStats`."""
+
+    __pydantic_config__: ClassVar = IGNORES_OTHERS
+
+    predictor: str
+    fps: float
+    stride_frames: Annotated[int, Interval(ge=1, le=10_000)]
+    camera: StoredCamera
+    horizons: Annotated[tuple[StoredHorizon, ...], Len(1, 100)]
+    covariance: tuple[tuple[float, ...], ...]
+    autocorrelation: Annotated[tuple[tuple[_Pair, ...], ...], Len(1)]
+    residuals: tuple[StoredRun, ...]
+
+    def __post_init__(self) -> None:
+        size = len(self.horizons)
+        if self.fps != 30.0:
+            raise RequestError(f"fps {self.fps:g}: must be 30")
+        if [row.frames for row in self.horizons] != list(range(1, size + 1)):
+            raise RequestError("'horizons' must be 1, 2, ... frames ahead")
+        if {len(self.covariance), *map(len, self.covariance)} != {2 * size}:
+            raise RequestError(f"'covariance' must be {2 * size} x {2 * size} numbers")
+        covariance = np.array(self.covariance)
+        with np.errstate(over="ignore", invalid="ignore"):
+            least = np.linalg.eigvalsh((covariance + covariance.T) / 2)[0]
+            is_positive = least >= -1e-6 * np.trace(covariance)
+        if not (np.array_equal(covariance, covariance.T) and is_positive):
+            raise RequestError("'covariance' must be symmetric without negative eigenvalues")
+        tables = {"autocorrelation": self.autocorrelation}
+        tables |= {f"residuals[{i}]": run.values for i, run in enumerate(self.residuals)}
+        for name, table in tables.items():
+            if set(map(len, table)) != {size}:
+                raise RequestError(f"'{name}' must be n x {size} x 2 numbers")
+
+
+def _from_document(stored: StoredErrorStats, source: Path, digest: str) -> ErrorStats:
+    scale = _metres(stored.camera)
+    both = np.tile(scale, len(stored.horizons))
     return ErrorStats(
-        predictor=str(stored["predictor"]),
-        stride=stride,
-        mean_abs=mean_abs,
-        bias=_array([row["bias"] for row in rows], "bias", (size, 2)) * scale,
-        covariance=covariance * np.outer(both, both),
-        autocorrelation=_array(stored["autocorrelation"], "autocorrelation", (None, size, 2)),
-        runs=tuple(
-            _array(run["values"], f"residuals[{index}]", (None, size, 2)) * scale
-            for index, run in enumerate(stored["residuals"])
-        ),
+        predictor=stored.predictor,
+        stride=stored.stride_frames,
+        mean_abs=np.array([row.mean_abs_m for row in stored.horizons]),
+        bias=np.array([row.bias for row in stored.horizons]) * scale,
+        covariance=np.array(stored.covariance) * np.outer(both, both),
+        autocorrelation=np.array(stored.autocorrelation),
+        runs=tuple(np.array(run.values) * scale for run in stored.residuals),
         source=source,
         sha256=digest,
     )
 
 
-def _metres(camera: Mapping[str, Any]) -> Floats:
+def _metres(camera: StoredCamera) -> Floats:
     """(2,) m that an error of one crop is, right and down: equations 6 and 7 of the paper."""
-    keys = ("fov_x_deg", "fov_y_deg", "crop_width", "crop_height", "depth_m")
-    given = _array([camera[key] for key in keys], "camera", (5,))
-    fov, crop, depth = given[:2], given[2:4], given[4]
-    if (given <= 0).any() or (fov >= 180).any():
-        raise ValueError("'camera' must have a field of view, a crop and a depth above 0")
-    return 2.0 * depth * np.tan(np.radians(fov / 2)) * crop
-
-
-def _array(values: Any, key: str, shape: tuple[int | None, ...]) -> Floats:
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (ValueError, TypeError):
-        raise ValueError(f"'{key}' is no table of numbers") from None
-    fits = array.ndim == len(shape) and array.size > 0
-    fits = fits and all(want in (None, n) for n, want in zip(array.shape, shape, strict=True))
-    if not fits or not np.isfinite(array).all():
-        wanted = " x ".join("n" if size is None else str(size) for size in shape)
-        raise ValueError(f"'{key}' must be {wanted} finite numbers")
-    return array
+    fov = np.array([camera.fov_x_deg, camera.fov_y_deg])
+    crop = np.array([camera.crop_width, camera.crop_height])
+    return 2.0 * camera.depth_m * np.tan(np.radians(fov / 2)) * crop

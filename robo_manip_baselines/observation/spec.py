@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from annotated_types import Interval
 from numpy.typing import NDArray
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -25,6 +26,7 @@ from robo_manip_baselines.observation.state import (
     State,
     TargetObservation,
 )
+from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 
 PRESETS = ("baseline", "current", "current_pred")
@@ -59,8 +61,10 @@ def size_text(size: Sequence[int]) -> str:
     return f"{size[0]}x{size[1]}"
 
 
+_Side = Annotated[int, Interval(ge=1, le=MAX_IMAGE_SIZE)]
+
 ImageSize = Annotated[
-    tuple[int, int],
+    tuple[_Side, _Side],
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="HEIGHTxWIDTH",
@@ -106,7 +110,7 @@ class ObservationSpec:
     """
 
     obs: str = "baseline"
-    horizon: int = 2
+    horizon: Annotated[int, Interval(ge=1, le=MAX_HORIZON)] = 2
     cameras: tuple[str, ...] = CAMERAS
     image_size: ImageSize = (480, 640)
     render_size: tyro.conf.Suppress[ImageSize | None] = None
@@ -176,15 +180,10 @@ class ObservationSpec:
         """Return the spec that ``to_json`` was called on.
 
         Raises:
-            RequestError: a value is not valid.
-            TypeError: a name is unknown.
+            RequestError: a name or a value is not valid.
         """
-        given: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
-        }
-        given.pop("error", None)
-        corruption = Corruption.from_json(given.pop("corruption", None) or {})
-        return cls(**given, corruption=corruption)
+        given = {name: value for name, value in values.items() if name != "error"}
+        return convert({**given, "corruption": given.get("corruption") or {}}, cls, "observation")
 
     def env_kwargs(self) -> dict[str, Any]:
         """Return the arguments of an environment that shows this."""

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from typing_extensions import TypedDict
+
 from robo_manip_baselines.data.demonstrations import Split
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec
@@ -20,19 +22,18 @@ from robo_manip_baselines.policy.presets import (
     ActionExecution,
     PolicyDims,
     TrainSettings,
-    with_tuples,
 )
 from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
 from robo_manip_baselines.runs.checkpoints import (
     checkpoint_folder,
     find_checkpoint,
-    read_json,
     read_manifest,
     verify,
-    write_json,
 )
+from robo_manip_baselines.runs.documents import convert, read_json
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import text_path
+from robo_manip_baselines.runs.files import write_json
+from robo_manip_baselines.runs.ranges import Amount, NonNegativeInt, Positive, Seed
 from robo_manip_baselines.runs.tensors import read_tensors, require_alike, require_finite
 
 if TYPE_CHECKING:
@@ -50,6 +51,22 @@ TRAINER = "trainer.json"
 
 INITIAL_WEIGHTS = "backbone_weights"
 """Setting of a policy that names a file of weights to start from, where it has one."""
+
+
+class DatasetFacts(TypedDict, total=False):
+    """Facts of the demonstrations that a policy was trained on.
+
+    Attributes:
+        folder: of the episodes.
+        episodes: how many.
+        content_hash: SHA-256 of their contents.
+        env_kwargs: arguments of their environment beside the observation spec.
+    """
+
+    folder: str
+    episodes: int
+    content_hash: str
+    env_kwargs: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -72,8 +89,7 @@ class Checkpoint:
         train_seed: seed of the training run.
         settings: optimiser, sampling and budget of the training run.
         split: training episodes and episodes held out.
-        dataset: facts of the demonstrations: ``folder``, ``episodes`` (how many), ``content_hash``
-            and ``env_kwargs``, arguments of their environment beside ``spec``.
+        dataset: facts of the demonstrations.
         versions: of the libraries that wrote it.
         content_hash: SHA-256 over weights, configuration and statistics; 64 hexadecimal digits.
     """
@@ -93,7 +109,7 @@ class Checkpoint:
     train_seed: int
     settings: TrainSettings
     split: Split
-    dataset: dict[str, Any]
+    dataset: DatasetFacts
     versions: dict[str, str]
     content_hash: str = ""
 
@@ -109,31 +125,64 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     folder = find_checkpoint(Path(path))
     digests = read_manifest(folder)
     verify(folder, digests, MODEL)
-    config = read_json(verify(folder, digests, CONFIG))
-    stats = read_json(verify(folder, digests, STATS))
     try:
-        return Checkpoint(
+        stored = read_json(verify(folder, digests, CONFIG), CheckpointDocument)
+        stats = read_json(verify(folder, digests, STATS))
+        network = load_part(policy_entry(stored.policy).config)
+        checkpoint = Checkpoint(
             folder=folder,
-            config=load_part(policy_entry(config["policy"]).config)(
-                **with_tuples(config["config"])
-            ),
-            dims=PolicyDims(**with_tuples(config["sizes"])),
-            spec=ObservationSpec.from_json(config["spec"]),
-            execution=ActionExecution.from_json(config["acting"]),
-            normalization=Normalization.from_json(stats),
-            action_names=tuple(config["action_names"]),
-            settings=TrainSettings(**config["settings"]),
-            split=Split.from_json(config["split"]),
+            config=convert(stored.config, network, "config"),
+            dims=stored.sizes,
+            spec=ObservationSpec.from_json(stored.spec),
+            execution=ActionExecution.from_json(stored.acting),
+            normalization=Normalization.from_json(stats, f"'{folder / STATS}'"),
+            action_names=stored.action_names,
+            settings=stored.settings,
+            split=stored.split,
             content_hash=_content_hash(digests),
-            **{name: config[name] for name in _UNCHANGED},
+            **{name: getattr(stored, name) for name in _UNCHANGED},
         )
+        _require_same_sizes(checkpoint)
     except RequestError as error:
-        raise RequestError(f"checkpoint '{folder}' does not fit this package: {error}") from error
-    except (KeyError, TypeError, AttributeError) as error:
         raise RequestError(
-            f"checkpoint '{folder}' does not fit this package ({type(error).__name__}: {error} in "
-            f"{CONFIG}); use the package that wrote it"
+            f"checkpoint '{folder}' does not fit this package: {error}; use the package that "
+            "wrote it"
         ) from error
+    return checkpoint
+
+
+@dataclass(frozen=True)
+class CheckpointDocument:
+    """Content of ``config.json``, named as in the first release; see `Checkpoint`."""
+
+    policy: str
+    env: str
+    control_period: Positive
+    xml_hash: str
+    step: NonNegativeInt
+    train_seed: Seed
+    dataset: DatasetFacts
+    versions: dict[str, str]
+    config: dict[str, Any]
+    action_names: tuple[str, ...]
+    split: Split
+    sizes: PolicyDims
+    spec: dict[str, Any]
+    acting: dict[str, Any]
+    settings: TrainSettings
+
+
+def _require_same_sizes(checkpoint: Checkpoint) -> None:
+    """Raise RequestError unless statistics and names are as many as the network's elements."""
+    dims, statistics = checkpoint.dims, checkpoint.normalization
+    sizes = {
+        "state_mean": (len(statistics.state_mean), dims.state),
+        "action_mean": (len(statistics.action_mean), dims.action),
+        "action_names": (len(checkpoint.action_names), dims.action),
+    }
+    for name, (found, wanted) in sizes.items():
+        if found != wanted:
+            raise RequestError(f"'{name}' has {found} elements, the network {wanted}")
 
 
 def load_model(checkpoint: Checkpoint, device: torch.device | str = "cpu") -> PolicyModel:
@@ -218,15 +267,39 @@ def write_checkpoint(
     return dataclasses.replace(checkpoint, folder=folder, content_hash=content_hash)
 
 
-def read_trainer(checkpoint: Checkpoint) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the trainer's state, verified: tensors by name, and JSON.
+@dataclass(frozen=True)
+class TrainerDocument:
+    """Content of ``trainer.json``: numbers for resuming.
+
+    Attributes:
+        step: optimiser steps done.
+        seconds: spent on them.
+        optimizer_steps: parameter -> steps in which it had a gradient.
+        metrics: ``names`` of the losses, and ``count`` of the steps whose sums are a tensor.
+    """
+
+    step: NonNegativeInt
+    seconds: Amount
+    optimizer_steps: dict[str, NonNegativeInt]
+    metrics: TrainerMetrics
+
+
+class TrainerMetrics(TypedDict):
+    """Losses since the last line of ``metrics.jsonl``."""
+
+    names: list[str]
+    count: NonNegativeInt
+
+
+def read_trainer(checkpoint: Checkpoint) -> tuple[dict[str, Tensor], TrainerDocument]:
+    """Read the trainer's state, verified: tensors by name, and numbers.
 
     Raises:
         RequestError: it is missing or damaged.
     """
     digests = read_manifest(checkpoint.folder)
     tensors, _ = read_tensors(verify(checkpoint.folder, digests, TRAINER_TENSORS))
-    return tensors, read_json(verify(checkpoint.folder, digests, TRAINER))
+    return tensors, read_json(verify(checkpoint.folder, digests, TRAINER), TrainerDocument)
 
 
 _UNCHANGED = (

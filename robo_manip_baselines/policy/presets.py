@@ -5,46 +5,33 @@ Nothing heavy is imported here, so that ``--help`` needs no PyTorch.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Interval
 
 from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.observation.spec import ImageSize
+from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.ranges import Amount, Count, Fraction, NonNegativeInt, require_ranges
 
 SAMPLERS = ("episode", "frame")
 PRECISIONS = ("auto", "fp32", "bf16")
 SCHEDULES = ("constant", "cosine")
 
+MAX_VECTOR = 4096
+"""Most elements of a state or an action."""
 
-def require_at_least(least: float, config: Any, *names: str) -> None:
-    """Require attributes of a configuration to be None, or finite and ``least`` or more.
+MAX_CAMERAS = 64
 
-    Raises:
-        RequestError: naming the first that is not.
-    """
-    for name in names:
-        value = getattr(config, name)
-        if value is not None and not least <= value < math.inf:
-            finite = ", and finite" if isinstance(value, float) else ""
-            raise RequestError(f"{name} {value}: must be {least} or more{finite}")
+MAX_CHUNK = 10_000
+"""Most actions that are predicted at once."""
 
-
-def require_proportion(config: Any, *names: str) -> None:
-    """Require attributes of a configuration to be 0 or more and less than 1.
-
-    Raises:
-        RequestError: naming the first that is not.
-    """
-    for name in names:
-        if not 0.0 <= getattr(config, name) < 1.0:
-            raise RequestError(f"{name} {getattr(config, name)}: must be 0 or more, less than 1")
-
-
-def with_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values that JSON or YAML held, their lists as the tuples that they were."""
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+Chunk = Annotated[int, Interval(ge=1, le=MAX_CHUNK)]
+Width = Annotated[int, Interval(ge=1, le=65536)]
+Layers = Annotated[int, Interval(ge=1, le=256)]
 
 
 @dataclass(frozen=True)
@@ -58,10 +45,13 @@ class PolicyDims:
         image: (H, W) in pixels.
     """
 
-    state: int
-    action: int
-    cameras: int
-    image: tuple[int, int]
+    state: Annotated[int, Interval(ge=1, le=MAX_VECTOR)]
+    action: Annotated[int, Interval(ge=1, le=MAX_VECTOR)]
+    cameras: Annotated[int, Interval(ge=0, le=MAX_CAMERAS)]
+    image: ImageSize
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -96,19 +86,19 @@ class TrainSettings:
         RequestError: a value that is not valid.
     """
 
-    batch_size: int = 8
-    learning_rate: float = 1e-5
-    weight_decay: float = 1e-4
+    batch_size: Annotated[int, Interval(ge=1, le=65536)] = 8
+    learning_rate: Annotated[float, Interval(gt=0.0, le=100.0)] = 1e-5
+    weight_decay: Amount = 1e-4
     schedule: str = "constant"
-    warmup_steps: int = 0
-    clip_norm: float = 0.0
+    warmup_steps: NonNegativeInt = 0
+    clip_norm: Amount = 0.0
     sampler: str = "episode"
-    epochs: int | None = None
-    steps: int | None = None
-    state_noise: float = 0.0
-    clock_noise: float = 0.0
-    validation_fraction: float = 0.2
-    ema_decay: float = 0.0
+    epochs: Count | None = None
+    steps: Count | None = None
+    state_noise: Amount = 0.0
+    clock_noise: Amount = 0.0
+    validation_fraction: Fraction = 0.2
+    ema_decay: Fraction = 0.0
     precision: str = "auto"
     compile: bool = False
 
@@ -118,12 +108,7 @@ class TrainSettings:
         require_choice("schedule", self.schedule, SCHEDULES)
         if (self.epochs is None) == (self.steps is None):
             raise RequestError("give the budget as --epochs or as --steps, one of the two")
-        require_at_least(1, self, "batch_size", "epochs", "steps")
-        if not self.learning_rate > 0.0:
-            raise RequestError(f"learning_rate {self.learning_rate}: must be more than 0")
-        require_at_least(0, self, "weight_decay", "warmup_steps", "clip_norm")
-        require_at_least(0, self, "state_noise", "clock_noise")
-        require_proportion(self, "validation_fraction", "ema_decay")
+        require_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -142,11 +127,11 @@ class ActionExecution:
     """
 
     temporal_ensemble: bool = True
-    ensemble_decay: float = 0.01
-    n_action_steps: int = 1
+    ensemble_decay: Annotated[float, Interval(ge=-100.0, le=100.0)] = 0.01
+    n_action_steps: Chunk = 1
 
     def __post_init__(self) -> None:
-        require_at_least(1, self, "n_action_steps")
+        require_ranges(self)
 
     def to_json(self) -> dict[str, Any]:
         """Return all settings under the names that checkpoints have had since the first release."""
@@ -158,8 +143,13 @@ class ActionExecution:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> ActionExecution:
-        """Undo `to_json`."""
-        return cls(values["temporal_ensemble"], values["decay"], values["execute"])
+        """Undo `to_json`.
+
+        Raises:
+            RequestError: a name or a value is not valid.
+        """
+        names = {"decay": "ensemble_decay", "execute": "n_action_steps"}
+        return convert({names.get(k, k): v for k, v in values.items()}, cls, "acting")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import multiprocessing
 import time
@@ -11,10 +10,11 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from robo_manip_baselines.data import (
@@ -35,18 +35,19 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     task_entry,
     without_library_path,
 )
-from robo_manip_baselines.policy.presets import require_at_least
 from robo_manip_baselines.rollout.agreement import VERSIONS
 from robo_manip_baselines.rollout.results import (
     completion_time,
     require_own_summary,
     require_seeds,
 )
+from robo_manip_baselines.runs.documents import as_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder, write_json
 from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_image
 from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
 from robo_manip_baselines.runs.progress import EpisodeProgress
+from robo_manip_baselines.runs.ranges import Quality, require_ranges
 from robo_manip_baselines.runs.versions import software_versions
 
 SUMMARY = "summary.json"
@@ -158,17 +159,15 @@ class Collection:
     seeds: range
     env_kwargs: dict[str, Any]
     codec: str = "jpeg"
-    quality: int = DEFAULT_QUALITY
-    workers: int = 1
+    quality: Quality = DEFAULT_QUALITY
+    workers: Annotated[int, Interval(ge=1, le=1024)] = 1
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
+        object.__setattr__(self, "env_kwargs", as_json(self.env_kwargs))
         require_choice("expert", self.expert, task_entry(self.env).experts)
         require_choice("image codec", self.codec, CODECS)
         require_seeds(self.seeds)
-        require_at_least(1, self, "workers")
-        if not 1 <= self.quality <= 100:
-            raise RequestError(f"image quality {self.quality}: must be 1 to 100")
+        require_ranges(self)
 
     def to_json(self) -> dict[str, Any]:
         """Return what JSON can hold."""

@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from annotated_types import Interval
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
@@ -26,7 +28,7 @@ from robo_manip_baselines.policy.checkpoint import (
     read_checkpoint,
     without_initial_weights,
 )
-from robo_manip_baselines.policy.presets import ActionExecution, require_at_least
+from robo_manip_baselines.policy.presets import ActionExecution, Chunk
 from robo_manip_baselines.rollout.agreement import require_continuation
 from robo_manip_baselines.rollout.results import (
     SUMMARY,
@@ -41,9 +43,11 @@ from robo_manip_baselines.rollout.rollout import ActingPolicy, Recording, rollou
 from robo_manip_baselines.rollout.videos import pick_for_video, video_name, write_video
 from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
+from robo_manip_baselines.runs.documents import as_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import locked, write_json
 from robo_manip_baselines.runs.progress import EpisodeProgress
+from robo_manip_baselines.runs.ranges import NonNegativeInt, Processes, require_ranges
 from robo_manip_baselines.runs.versions import software_versions
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
@@ -92,20 +96,17 @@ class EvaluationConfig:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     corruption: Corruption | None = None
     temporal_ensemble: bool = False
-    n_action_steps: int | None = None
-    num_envs: int = 8
-    workers: int = 2
+    n_action_steps: Chunk | None = None
+    num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
+    workers: Processes = 2
     device: str = "auto"
     precision: str = "fp32"
-    videos: int = 0
+    videos: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "env_kwargs", json.loads(json.dumps(self.env_kwargs)))
+        object.__setattr__(self, "env_kwargs", as_json(self.env_kwargs))
         require_seeds(self.seeds)
-        require_at_least(1, self, "num_envs", "n_action_steps")
-        require_at_least(0, self, "workers")
-        if self.videos < 0:
-            raise RequestError(f"video {self.videos}: must be 0 or more")
+        require_ranges(self)
         if self.temporal_ensemble and self.n_action_steps is not None:
             raise RequestError("--temporal_ensemble and --n_action_steps: give one of them")
 
@@ -168,7 +169,7 @@ class EvaluationPlan:
         spec = checkpoint.spec
         if config.corruption is not None:
             spec = replace(spec, corruption=config.corruption.pinned())
-        recorded = checkpoint.dataset.get("env_kwargs", {})
+        recorded = checkpoint.dataset.env_kwargs
         if "motion_library" in config.env_kwargs:  # another file, of other content perhaps
             recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
         if "motion" in config.env_kwargs and not parse_motion(config.env_kwargs["motion"]).recorded:
@@ -243,7 +244,7 @@ class EvaluationPlan:
             "network": asdict(without_initial_weights(checkpoint.config)),
             "settings": asdict(checkpoint.settings),
             "step": checkpoint.step,
-            "demonstrations": checkpoint.dataset.get("content_hash"),
+            "demonstrations": checkpoint.dataset.content_hash,
         }
         settings = {
             "env_kwargs": kwargs,

@@ -8,40 +8,50 @@ from __future__ import annotations
 
 import json
 import os
-import types
 import typing
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.rollout.agreement import require_one_evaluation
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.documents import (
+    Schema,
+    as_json,
+    convert,
+    parse_json,
+    read_json,
+    read_json_lines,
+    shortened,
+    shown,
+)
+from robo_manip_baselines.runs.errors import RequestError, require_printable
 from robo_manip_baselines.runs.files import (
     AppendFile,
     FileKind,
     FolderKind,
     prepare_folder,
-    read_json,
     require_out_file,
     require_out_folder,
     write_json,
     write_text,
 )
 from robo_manip_baselines.runs.progress import closing_table
+from robo_manip_baselines.runs.ranges import Amount, Episodes, NonNegativeInt, Seed, require_range
 
 ROW_VERSION = 3
 """of a row; version 2 held neither the settings of the evaluation nor the motion, which was
 ``recorded``; version 1 did not hold the observation spec either, and called the condition
 ``arm``."""
 
-SCHEMA = "robo_manip_baselines/evaluation"
-SCHEMA_VERSION = 1
+SCHEMA = Schema("robo_manip_baselines/evaluation", 1)
 
 RESULTS = "results.jsonl"
 MANIFEST = "evaluation.json"
@@ -82,11 +92,11 @@ class EpisodeResult:
     """
 
     env: str
-    seed: int
+    seed: Seed
     is_success: bool
     is_success_strict: bool
-    completion_time: float | None
-    steps: int
+    completion_time: Amount | None
+    steps: NonNegativeInt
     failure: str
     motion_clip: str
     motion_subject: str
@@ -95,7 +105,7 @@ class EpisodeResult:
     policy: str = ""
     condition: str = ""
     observation: dict[str, Any] | None = None
-    train_seed: int | None = None
+    train_seed: Seed | None = None
     checkpoint: str = ""
     versions: dict[str, str] = field(default_factory=dict)
     settings: dict[str, Any] | None = None
@@ -107,18 +117,18 @@ class EpisodeResult:
         return json.dumps({"version": ROW_VERSION, **values, **columns}, allow_nan=False)
 
     @classmethod
-    def from_line(cls, line: str) -> EpisodeResult:
-        """Read a row of this version or of an earlier one.
+    def from_line(cls, line: str, source: str = "row") -> EpisodeResult:
+        """Read a row of this version or of an earlier one; ``source`` begins messages.
 
         Raises:
-            ValueError: it is no such row; the message says what is wrong with it.
+            RequestError: it is no such row; the message says what is wrong with it.
         """
-        values = json.loads(line)
-        if not isinstance(values, dict):
-            raise ValueError("it is no JSON object")
+        values = convert(parse_json(line, source), dict, source)
         version = values.pop("version", 1)
-        if version not in range(1, ROW_VERSION + 1):
-            raise ValueError(f"'version' is {version}; this release reads 1 to {ROW_VERSION}")
+        if type(version) is not int or version not in range(1, ROW_VERSION + 1):
+            raise RequestError(
+                f"{source}: version {shown(version)}; this release reads 1 to {ROW_VERSION}"
+            )
         if version < 3:
             values.setdefault("settings", None)
             values.setdefault("motion", "recorded")
@@ -126,61 +136,38 @@ class EpisodeResult:
             values.setdefault("observation", None)
             if "arm" in values:
                 values["condition"] = values.pop("arm")
-        hints = typing.get_type_hints(cls)
-        hints.pop("columns")
-        given = {name: _checked(values, name, hint) for name, hint in hints.items()}
-        task = task_entry(given["env"])
-        columns = {}
-        for column in task.columns:
-            kind: Any = Vector if column.kind == "vector" else float
-            hint = kind | None if column.is_optional else kind
-            value = _checked(values, column.name, hint)
-            columns[column.name] = tuple(value) if isinstance(value, list) else value
-        if unknown := sorted(set(values) - set(given) - set(columns)):
-            raise ValueError(f"'{unknown[0]}' is unknown")
-        if given["failure"] and given["failure"] not in task.failures:
-            raise ValueError(f"'failure' is {json.dumps(given['failure'])}")
-        return cls(**given, columns=columns)
+        task = task_entry(convert(values.get("env"), str, f"{source}: env"))
+        row = convert(values, row_type(task.name), source)
+        if row["failure"] and row["failure"] not in task.failures:
+            valid = ", ".join(task.failures)
+            raise RequestError(
+                f"{source}: failure {shown(row['failure'])}: unknown; valid: {valid}"
+            )
+        require_printable(f"{source}: condition", row["condition"])
+        columns = {column.name: row.pop(column.name) for column in task.columns}
+        return cls(**row, columns=columns)
+
+
+@cache
+def row_type(task: str) -> Any:
+    """Return the type of the rows of a task, all of whose fields are required."""
+    hints: Any = typing.get_type_hints(EpisodeResult, include_extras=True)
+    del hints["columns"]
+    for column in task_entry(task).columns:
+        kind: Any = tuple[float, float, float] if column.kind == "vector" else float
+        hints[column.name] = kind | None if column.is_optional else kind
+    return TypedDict(f"{task} row", hints)  # pyright: ignore[reportArgumentType]
 
 
 def require_seeds(seeds: range) -> None:
-    """Require one seed or more, none of them negative.
+    """Require one seed or more, all within their range.
 
     Raises:
         RequestError: naming the option that is wrong.
     """
-    if not seeds:
-        raise RequestError(f"num_episodes {seeds.stop - seeds.start}: must be 1 or more")
-    if seeds.start < 0:
-        raise RequestError(f"seed {seeds.start}: must be 0 or more")
-
-
-Vector = tuple[float, float, float]
-
-
-def _checked(values: dict[str, Any], name: str, hint: Any) -> Any:
-    if name not in values:
-        raise ValueError(f"'{name}' is missing")
-    if not _fits(values[name], hint):
-        raise ValueError(f"'{name}' is {json.dumps(values[name])}")
-    return values[name]
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a JSON value is of the declared type."""
-    origin, parts = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        return any(_fits(value, part) for part in parts)
-    if origin is tuple:
-        return isinstance(value, list) and len(value) == 3 and all(_fits(v, float) for v in value)
-    if origin is dict:
-        is_text = parts[1] is str
-        return isinstance(value, dict) and all(
-            isinstance(v, str) or not is_text for v in value.values()
-        )
-    if hint in (float, int):
-        return isinstance(value, hint | int) and not isinstance(value, bool)
-    return isinstance(value, hint)
+    require_range("num_episodes", seeds.stop - seeds.start, Episodes)
+    require_range("seed", seeds.start, Seed)
+    require_range("seed + num_episodes - 1 =", seeds.stop - 1, Seed)
 
 
 def read_rows(path: Path) -> list[EpisodeResult]:
@@ -189,19 +176,13 @@ def read_rows(path: Path) -> list[EpisodeResult]:
     Raises:
         RequestError: the file cannot be read, or a row is damaged.
     """
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        line = f"'{path}' cannot be read: {error.strerror}; name a results.jsonl file"
-        raise RequestError(line) from error
     rows = []
-    for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
+    for number, line in read_json_lines(path):
         try:
-            rows.append(EpisodeResult.from_line(line))
-        except ValueError as error:
+            rows.append(EpisodeResult.from_line(line, f"'{path}', line {number}"))
+        except RequestError as error:
             raise RequestError(
-                f"'{path}', line {number} is damaged: {error}; remove that line, and its episode "
-                "is done again"
+                f"{error}; remove that line, and its episode is done again"
             ) from error
     return rows
 
@@ -285,7 +266,7 @@ def open_results(
     done = {r.seed: r for r in read_results(folder)} if path.exists() else {}
     prepare_folder(folder)
     if not (folder / MANIFEST).exists():
-        content = {"schema": SCHEMA, "version": SCHEMA_VERSION, "settings": settings, **facts}
+        content = {**SCHEMA.to_json(), "settings": settings, **facts}
         write_json(folder / MANIFEST, content)
     if path.exists():  # drop a torn row
         os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
@@ -301,21 +282,16 @@ def _refuse_other_settings(folder: Path, settings: dict[str, Any]) -> None:
             raise RequestError(f"'{folder}' holds {RESULTS} without {MANIFEST}; give another --out")
         return
     try:
-        content = read_json(path)
-        schema, version, there = content["schema"], content["version"], content["settings"]
-    except (RequestError, KeyError) as error:
-        raise RequestError(f"'{path}' is damaged; give another --out") from error
-    if (schema, version) != (SCHEMA, SCHEMA_VERSION):
-        raise RequestError(
-            f"'{path}' is of {schema} version {version}, not {SCHEMA} version {SCHEMA_VERSION}; "
-            "give another --out"
-        )
-    # As JSON would give them back: tuples become lists.
-    wanted = json.loads(json.dumps(settings))
+        content = read_json(path, schema=SCHEMA)
+        there = convert(content.get("settings"), dict, f"'{path}': settings")
+    except RequestError as error:
+        raise RequestError(f"{error}; give another --out") from error
+    wanted = as_json(settings)
     for name in sorted({*wanted, *there}):
         if there.get(name) != wanted.get(name):
+            old, new = (shortened(value, 300) for value in (there.get(name), wanted.get(name)))
             raise RequestError(
-                f"'{folder}' holds results with {name} {there.get(name)}, not {wanted.get(name)}; "
+                f"'{folder}' holds results with {name} {old}, not {new}; "
                 "give another --out or remove that folder"
             )
 

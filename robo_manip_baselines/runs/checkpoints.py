@@ -9,25 +9,32 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
+from robo_manip_baselines.runs.documents import Schema, read_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
     atomic_folder,
     file_digest,
-    read_json,
     remove_folder,
     remove_temporaries,
     write_json,
 )
 
-SCHEMA = "robo_manip_baselines/checkpoint"
-SCHEMA_VERSION = 1
+SCHEMA = Schema("robo_manip_baselines/checkpoint", 1)
 MANIFEST = "manifest.json"
 CHECKPOINTS = "checkpoints"
 """Folder of a run that holds its checkpoints."""
 
 _STEP_NAME = re.compile(r"step_(\d{8,})")
+
+
+@dataclass(frozen=True)
+class CheckpointManifest:
+    """Content of ``manifest.json``; ``sha256``: file name -> 64 hexadecimal digits."""
+
+    sha256: dict[str, str]
 
 
 def step_folder(run: Path, step: int) -> Path:
@@ -74,7 +81,7 @@ def checkpoint_folder(folder: Path) -> Iterator[Path]:
     with atomic_folder(folder) as temporary:
         yield temporary
         digests = {path.name: file_digest(path) for path in sorted(temporary.iterdir())}
-        manifest = {"schema": SCHEMA, "version": SCHEMA_VERSION, "sha256": digests}
+        manifest = {**SCHEMA.to_json(), "sha256": digests}
         write_json(temporary / MANIFEST, manifest)
         mode = (temporary / MANIFEST).stat().st_mode
         for path in temporary.iterdir():
@@ -98,19 +105,7 @@ def read_manifest(folder: Path) -> dict[str, str]:
     Raises:
         RequestError: it is not a checkpoint, or of a newer schema.
     """
-    manifest = read_json(folder / MANIFEST)
-    if manifest.get("schema") != SCHEMA:
-        raise RequestError(f"'{folder}' is no checkpoint: {MANIFEST} does not say '{SCHEMA}'")
-    version = manifest.get("version")
-    if version != SCHEMA_VERSION:
-        raise RequestError(
-            f"checkpoint '{folder}' has version {version}, this package reads {SCHEMA_VERSION}; "
-            "use the package that wrote it"
-        )
-    digests = manifest.get("sha256")
-    if not isinstance(digests, dict):
-        raise RequestError(f"checkpoint '{folder}' is damaged: {MANIFEST} lists no files")
-    return digests
+    return read_json(folder / MANIFEST, CheckpointManifest, SCHEMA).sha256
 
 
 def verify(folder: Path, digests: Mapping[str, str], name: str) -> Path:

@@ -16,6 +16,8 @@ import os
 import re
 import select
 import sys
+import tempfile
+import time
 import traceback
 import unicodedata
 from collections.abc import Callable, Sequence
@@ -27,6 +29,7 @@ import tyro
 
 from robo_manip_baselines.runs.errors import RequestError, WriteError, disk_problem
 from robo_manip_baselines.runs.interrupt import signals_as_interrupt
+from robo_manip_baselines.runs.ranges import require_ranges
 
 Options = TypeVar("Options")
 
@@ -75,7 +78,8 @@ def run_command(
 ) -> NoReturn:
     """Run ``main`` and end the process with the matching exit code.
 
-    A `RequestError` becomes one line on stderr, without a traceback.
+    A `RequestError` becomes one line on stderr, without a traceback; so does any other exception,
+    whose traceback goes to a file that the line names.
 
     Args:
         main: the command; returns the exit code, None being 0.
@@ -112,8 +116,7 @@ def run_command(
             what = f"read or write '{_text(file)}'" if file else "write the output"
             code = _say(f"error: cannot {what}: {reason}", EXIT_FAILED)
         else:
-            traceback.print_exc()
-            code = EXIT_FAILED
+            code = _say(_unforeseen(error), EXIT_FAILED)
     sys.exit(_flush(code))
 
 
@@ -160,6 +163,7 @@ def parse(
             text = text.split("\n\nExample:")[0]
             _call_tyro(options_type, text, [*rest, "--help"], default, program)
         raise RequestError(_unknown_message(unknown, page.getvalue(), program))
+    require_ranges(result, "--{} {}")
     return result
 
 
@@ -258,6 +262,27 @@ def _box_to_line(text: str) -> str:
 
 def _help_hint(prog: str) -> str:
     return f"'{prog} --help' lists what is valid"
+
+
+def _unforeseen(error: Exception) -> str:
+    """Return the line for an exception that nothing foresaw; its traceback goes to a file."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    name = f"error_{time.strftime('%Y%m%d_%H%M%S')}_{os.getpid()}.log"
+    command = " ".join(sys.argv)
+    text = f"{command}\n{traceback.format_exc()}".encode(errors="backslashreplace")
+    where = "no log file could be written"
+    for folder in (cache / "robo_manip_baselines", Path(tempfile.gettempdir())):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with (folder / name).open("xb") as file:  # never over a file or link of somebody else
+                file.write(text)
+            where = f"the traceback is in '{folder / name}'"
+            break
+        except OSError:
+            continue
+    message = _one_line(error)[:300]
+    kind = type(error).__name__
+    return f"error: {kind}: {message}; {where}" if message else f"error: {kind}; {where}"
 
 
 def _one_line(message: object) -> str:

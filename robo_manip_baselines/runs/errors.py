@@ -49,9 +49,10 @@ def require_choice(what: str, given: str, valid: Iterable[str]) -> str:
         RequestError: naming the valid choices, and the nearest one if there is any.
     """
     choices = sorted(valid)
-    text = given if isinstance(given, str) else " ".join(repr(given).split())
     if isinstance(given, str) and given in choices:
         return given
+    text = given if isinstance(given, str) else " ".join(repr(given).split())
+    text = text if len(text) <= 80 else f"{text[:80]}…"
     close = difflib.get_close_matches(text, choices, n=1)
     hint = f" (did you mean '{close[0]}'?)" if close else ""
     raise RequestError(f"unknown {what} '{text}'{hint}; valid: {', '.join(choices)}")
@@ -71,3 +72,19 @@ def require_integer(what: str, given: Any, low: int, high: int, unit: str = "") 
         if number is not None and low <= number <= high:
             return number
     raise RequestError(f"{what} {given!r}: must be {low} to {high}{unit}, a whole number")
+
+
+def require_printable(what: str, given: str, length: int = 200) -> str:
+    """Return ``given`` if it is one line without control characters, and not too long.
+
+    Figures, tables and pages show it as it is.
+
+    Raises:
+        RequestError: it is not.
+    """
+    if len(given) > length:
+        raise RequestError(f"{what} '{given[:80]}…': must have {length} characters or fewer")
+    for letter in given:
+        if not letter.isprintable():
+            raise RequestError(f"{what} {given!a}: must be one line, without {letter!a}")
+    return given

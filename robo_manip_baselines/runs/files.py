@@ -303,23 +303,6 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, to_json(value))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        RequestError: it is missing, or no JSON object.
-    """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RequestError(f"cannot read '{path}': {error.strerror or error}") from error
-    except ValueError as error:
-        raise RequestError(f"'{path}' is damaged: {error}") from error
-    if not isinstance(value, dict):
-        raise RequestError(f"'{path}' is damaged: it holds no JSON object")
-    return value
-
-
 @contextmanager
 def text_path(path: Path) -> Iterator[str]:
     """Yield a path to a file as UTF-8 text, for libraries that take no other bytes.

@@ -14,12 +14,15 @@ import os
 import socket
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
+from robo_manip_baselines.runs.documents import IGNORES_OTHERS, convert, parse_json, read_json_lines
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.extras import pip_install
 from robo_manip_baselines.runs.files import AppendFile, atomic_file, disk_errors, write_text
+from robo_manip_baselines.runs.ranges import NonNegativeInt
 
 TENSORBOARD = "tensorboard"
 """Folder of a run with files for TensorBoard."""
@@ -31,15 +34,29 @@ EVENTS_SUFFIX = ".run"
 LOGGERS = ("tensorboard", "wandb", "none")
 
 
+@dataclass(frozen=True)
+class MetricsLine:
+    """What every line of ``metrics.jsonl`` has, beside numbers by name."""
+
+    __pydantic_config__: ClassVar = IGNORES_OTHERS
+
+    kind: Literal["train", "validation"]
+    step: NonNegativeInt
+
+
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Read ``metrics.jsonl``; a last line that was cut off is left out."""
+    """Read ``metrics.jsonl``; a last line that was cut off is left out.
+
+    Raises:
+        RequestError: the file cannot be read, or another line is damaged.
+    """
     lines: list[dict[str, Any]] = []
-    if path.is_file():
-        for text in path.read_text(encoding="utf-8").splitlines():
-            try:
-                lines.append(json.loads(text))
-            except ValueError:
-                break
+    for number, text in read_json_lines(path) if path.exists() else ():
+        source = f"'{path}', line {number}"
+        values = convert(parse_json(text, source), dict, source)
+        head = convert(values, MetricsLine, source)
+        rest = {name: value for name, value in values.items() if name not in vars(head)}
+        lines.append({**vars(head), **convert(rest, dict[str, float], source)})
     return lines
 
 

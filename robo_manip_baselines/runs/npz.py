@@ -7,7 +7,6 @@ type, shape and size are compared with the table before any of its data are read
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import struct
 import zipfile
@@ -19,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from robo_manip_baselines.runs.documents import convert, parse_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 
@@ -169,25 +169,8 @@ def read_json_array(arrays: Arrays, key: str, name: str | Path) -> dict[str, Any
     Raises:
         RequestError: it is no JSON object; ``name`` is that of the file.
     """
-    try:
-        value = parse_json(str(arrays[key]), f"{name}: '{key}'")
-    except ValueError:
-        value = None
-    if not isinstance(value, dict):
-        raise RequestError(f"{name}: '{key}' is not a JSON object; make the file again")
-    return value
-
-
-def parse_json(text: str, source: str) -> Any:
-    """Parse JSON text; ``source`` is for messages.
-
-    Raises:
-        ValueError: it is no JSON, or nested too deeply.
-    """
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{source} is no JSON: {error}") from None
+    source = f"{name}: '{key}'"
+    return convert(parse_json(str(arrays[key]), source), dict, source)
 
 
 def arrays_digest(arrays: Mapping[str, np.ndarray]) -> str:

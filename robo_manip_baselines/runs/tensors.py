@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robo_manip_baselines.runs.documents import convert, parse_json
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.npz import parse_json
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -107,9 +107,7 @@ def _header_length(start: bytes, size: int) -> int:
 
 def _check_header(header: bytes, size: int) -> dict[str, str]:
     """Check types, shapes and places against ``size`` bytes of data; return the texts."""
-    entries = parse_json(header.decode("utf-8"), "its header")
-    if not isinstance(entries, dict):
-        raise ValueError("its header is no JSON object")
+    entries = convert(parse_json(header.decode("utf-8"), "its header"), dict, "its header")
     metadata = entries.pop(_METADATA, {})
     if not isinstance(metadata, dict) or not _all_of(str, metadata.values()):
         raise ValueError(f"'{_METADATA}' is no object of texts")

@@ -23,8 +23,9 @@ from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
-from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings, require_at_least
+from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.ranges import Count, NonNegativeInt, Seed, require_range
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.images import ImageStore
 
@@ -63,8 +64,8 @@ class ExampleSampler:
         self.sampler = require_choice("sampler", sampler, SAMPLERS)
         self.batch_size = batch_size
         self.seed = seed
-        require_at_least(1, self, "batch_size")
-        require_at_least(0, self, "seed")
+        require_range("batch_size", batch_size, Count)
+        require_range("seed", seed, Seed)
         if self.lengths.ndim != 1 or not self.lengths.size or self.lengths.min() < 1:
             raise RequestError("training needs at least one episode, each of at least one step")
         by_episode = sampler == "episode"
@@ -239,8 +240,7 @@ class BatchLoader:
             raise RequestError(
                 f"batch_size {sampler.batch_size}: must be at least the {world_size} processes"
             )
-        if depth < 0:
-            raise ValueError(f"depth {depth}: must be 0 or more")
+        require_range("depth", depth, NonNegativeInt)
         self._sampler, self._model, self._seed = sampler, model, seed
         self._state_noise = state_noise
         self._rank, self._world_size, self._depth = rank, world_size, depth

@@ -7,13 +7,13 @@ as in every release.
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import tyro
-import yaml
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
@@ -21,13 +21,13 @@ from robo_manip_baselines.observation.spec import parse_image_size, size_text
 from robo_manip_baselines.policy.presets import (
     ActionExecution,
     TrainSettings,
-    require_at_least,
-    with_tuples,
 )
 from robo_manip_baselines.policy.registry import policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.documents import as_json, convert, read_yaml
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import FolderKind, write_text
+from robo_manip_baselines.runs.ranges import Count, Episodes, Seed, require_ranges
 
 Network = TypeVar("Network")
 
@@ -87,21 +87,20 @@ class TrainConfig(Generic[Network]):
     spec: tyro.conf.OmitArgPrefixes[ObservationSpec]
     env: str = "FeedingEnv"
     dataset: Path | None = None
-    num_episodes: int | None = None
+    num_episodes: Episodes | None = None
     preset: str = "cpu"
-    seed: int = 0
+    seed: Seed = 0
     device: str = "auto"
     out: Path | None = None
     logger: str = "tensorboard"
-    log_every: int = 50
-    validate_every: int = 500
-    checkpoint_every: int = 1000
+    log_every: Count = 50
+    validate_every: Count = 500
+    checkpoint_every: Count = 1000
 
     def __post_init__(self) -> None:
         require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
         task_entry(self.env)
-        require_at_least(1, self, "log_every", "validate_every", "checkpoint_every")
-        require_at_least(0, self, "seed")
+        require_ranges(self)
 
     @classmethod
     def from_preset(
@@ -160,27 +159,32 @@ class TrainConfig(Generic[Network]):
         Raises:
             RequestError: a name or a value that is not valid.
         """
-        env = values.get("env", cls.env)
-        default = cls.from_preset(values.get("policy", ""), values.get("preset", "cpu"), env)
+        env, policy, preset = (
+            convert(values.get(name, default), str, name)
+            for name, default in (("env", cls.env), ("policy", ""), ("preset", "cpu"))
+        )
+        default = cls.from_preset(policy, preset, env)
         known = [*default.to_json(), "corruption"]
         for name in values:
             require_choice("option", name, known)
-        given = with_tuples(values)
-        for name in ("dataset", "out"):
-            given[name] = Path(given[name]) if given.get(name) else None
+        given = dict(values)
         if "image_size" in given:
-            given["image_size"] = parse_image_size(given["image_size"])
+            given["image_size"] = parse_image_size(convert(given["image_size"], str, "image_size"))
         is_on = given.pop("corruption", True) is not False  # --no_corruption of older releases
         names = _CORRUPTION.items() if is_on else ()
-        corruption = {of: given[name] for name, of in names if given.get(name) is not None}
-        given["corruption"] = Corruption(**corruption)
-
-        def changed(part: Any) -> Any:
-            names = {item.name for item in fields(part)} & given.keys()
-            return dataclasses.replace(part, **{name: given[name] for name in names})
-
-        given |= {part: changed(getattr(default, part)) for part in _PARTS}
-        return changed(default)
+        given["corruption"] = {of: given[n] for n, of in names if given.get(n) is not None}
+        parts: dict[str, Any] = {}
+        for name in _PARTS:
+            part = getattr(default, name)
+            own = {item.name for item in fields(part)} & given.keys()
+            changes = {item: given[item] for item in own}
+            parts[name] = convert(
+                as_json(dataclasses.asdict(part) | changes), type(part), "options"
+            )
+        kinds = typing.get_type_hints(cls, include_extras=True)
+        own = (kinds.keys() - set(_PARTS)) & given.keys()
+        parts |= {name: convert(given[name], kinds[name], name) for name in own}
+        return dataclasses.replace(default, **parts)
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -189,16 +193,7 @@ def read_config(path: Path) -> dict[str, Any]:
     Raises:
         RequestError: it cannot be read, or is no mapping.
     """
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RequestError(f"cannot read '{path}': {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RequestError(f"'{path}' is no YAML: {error}") from error
-    values = {} if values is None else values
-    if not isinstance(values, dict):
-        raise RequestError(f"'{path}' must be lines of 'option: value'")
-    return {str(name): value for name, value in values.items()}
+    return read_yaml(path)
 
 
 def write_config(run: Path, config: TrainConfig[Any]) -> None:
@@ -207,6 +202,8 @@ def write_config(run: Path, config: TrainConfig[Any]) -> None:
 
 
 def _to_yaml(config: TrainConfig[Any]) -> str:
+    import yaml  # slow to import
+
     values = {name: value for name, value in config.to_json().items() if name != "out"}
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 

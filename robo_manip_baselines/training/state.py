@@ -183,14 +183,14 @@ class TrainerState:
         """
         wanted = self.model.state_dict()
         weights = read_weights(checkpoint, wanted)
-        tensors, json = read_trainer(checkpoint)
+        tensors, numbers = read_trainer(checkpoint)
         source = checkpoint.folder / TRAINER_TENSORS
         expected = {f"weights/{name}": value for name, value in wanted.items() if self.average}
         expected |= {
             f"{moment}/{name}": parameter.detach()
             for name, parameter in self._named()
             for moment in _MOMENTS
-            if name in json["optimizer_steps"]
+            if name in numbers.optimizer_steps
         }
         state = {name: value for name, value in tensors.items() if name != "metrics"}
         require_alike(state, expected, source)
@@ -202,19 +202,19 @@ class TrainerState:
         self.model.load_state_dict(weights)
         fused = bool(self.optimizer.defaults["fused"])
         for name, parameter in self._named():
-            if name not in json["optimizer_steps"]:
+            if name not in numbers.optimizer_steps:
                 continue
             device = parameter.device if fused else "cpu"
-            count = torch.tensor(float(json["optimizer_steps"][name]), device=device)
+            count = torch.tensor(float(numbers.optimizer_steps[name]), device=device)
             self.optimizer.state[parameter] = {"step": count}
             for moment in _MOMENTS:  # in the memory layout of the parameter, as AdamW makes them
                 value = torch.empty_like(parameter).copy_(tensors[f"{moment}/{name}"])
                 self.optimizer.state[parameter][moment] = value
-        self.losses.names = tuple(json["metrics"]["names"])
-        self.losses.count = json["metrics"]["count"]
+        self.losses.names = tuple(numbers.metrics["names"])
+        self.losses.count = numbers.metrics["count"]
         if self.losses.count:
             self.losses.sums = tensors["metrics"].to(next(self.model.parameters()).device)
-        return json["seconds"]
+        return numbers.seconds
 
     def _named(self) -> Iterator[tuple[str, nn.Parameter]]:
         trained = set(map(id, self.trained))

@@ -115,9 +115,9 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
     ("lines", "words"),
     [
         ("- {name: a, horizn: 3}", ["line 3", "horizn", "did you mean 'horizon'"]),
-        ("- {name: a, horizon: three}", ["line 3", "horizon must be a whole number", "'three'"]),
+        ("- {name: a, horizon: three}", ["line 3", "horizon: must be a whole number", "'three'"]),
         ("- {name: a, horizon: true}", ["line 3", "a whole number"]),
-        ("- {name: a, horizon: 6}", ["line 3", "horizon 6", "1 to 5"]),
+        ("- {name: a, horizon: 6}", ["line 3", "horizon 6", "5 or less"]),
         ("- {name: a, error: unifrom}", ["line 3", "unifrom", "did you mean 'uniform'"]),
         ("- {name: a, obs: curent}", ["line 3", "did you mean 'current'"]),
         ("- {name: a, obs: current, error: uniform}", ["line 3", "forecasts"]),
@@ -135,14 +135,14 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
         ("- {obs: current}", ["line 3", "no name"]),
         ("- {name: a b}", ["line 3", "'a b'", "letters"]),
         ("- {name: ../a}", ["line 3", "letters"]),
-        ("- current", ["line 3", "mapping"]),
+        ("- current", ["line 3", "must be an object"]),
         ("- {name: a}\n  - {name: b}\n  - {name: a}", ["line 5", "'a' is there twice"]),
         ("- {name: current, obs: current_pred}", ["line 3", "'current'", "of the paper"]),
         (
             "- {name: current_pred_h2, expert: anticipatory}",
             ["line 3", "of the paper", "another name"],
         ),
-        ("[]", ["no conditions"]),
+        ("[]", ["conditions: must have 1 elements or more"]),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_with_its_number(
@@ -160,14 +160,14 @@ def test_what_is_wrong_is_said_in_one_line_with_its_number(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("conditions: 3", "a list 'conditions:'"),
-        ("- {name: a}", "a list 'conditions:'"),
+        ("conditions: 3", "conditions: must be a list, not 3"),
+        ("- {name: a}", "must be an object, not a list of 1"),
         ("conditions: [{name: a}", "no YAML"),
         ("env: FedingEnv\nconditions: [{name: a}]", "did you mean 'FeedingEnv'"),
         ("envs: FeedingEnv\nconditions: [{name: a}]", "did you mean 'env'"),
         ("presets: {smoke: [b]}\nconditions: [{name: a}]", "unknown condition 'b'"),
-        ("presets: {smoke: b}\nconditions: [{name: a}]", "'published', or a list"),
-        ("presets: [b]\nconditions: [{name: a}]", "'published', or a list"),
+        ("presets: {smoke: b}\nconditions: [{name: a}]", "presets.smoke: must be a list, not 'b'"),
+        ("presets: [b]\nconditions: [{name: a}]", "presets: must be an object"),
         ("presets: {paper: published}\nconditions: [{name: a}]", "unknown condition 'baseline'"),
     ],
 )

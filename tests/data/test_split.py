@@ -75,10 +75,10 @@ def test_json_round_trip() -> None:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ([1, 2], "needs 'train', a list of seeds"),
-        ({"train": [1]}, "needs 'validation', a list of seeds"),
-        ({"train": [1, "2"], "validation": []}, "needs 'train', a list of seeds"),
-        ({"train": [1, True], "validation": []}, "needs 'train', a list of seeds"),
+        ([1, 2], "split: must be an object, not a list of 2"),
+        ({"train": [1]}, "split: validation: is missing"),
+        ({"train": [1, "2"], "validation": []}, r"train\[1\]: must be a whole number, not '2'"),
+        ({"train": [1, True], "validation": []}, r"train\[1\]: must be a whole number, not true"),
         ({"train": [], "validation": [1]}, "at least one training seed"),
         ({"train": [1, 2], "validation": [2]}, "none in both"),
     ],

@@ -52,7 +52,7 @@ def test_help_lists_the_commands_and_examples(capsys) -> None:
         (["extrct"], "did you mean 'extract'"),
         (["extract", "--nonsense"], "--nonsense"),
         (["extract", "--fps", "many", "a.mp4"], "'many'"),
-        (["extract", "a.mp4", "--max_gap", "7"], "--max_gap 7.0: between 0 and 1 s"),
+        (["extract", "a.mp4", "--max_gap", "7"], "--max_gap 7.0: must be 0 to 1"),
         ([], "extract, export-motion, export-surface"),
     ],
 )

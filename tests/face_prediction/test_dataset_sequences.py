@@ -177,15 +177,15 @@ def test_largest_angle_is_between_any_two() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"history": 0}, "--history 0: between 1"),
-        ({"future": 0}, "--future 0: between 1"),
-        ({"stride": 0}, "--stride 0: between 1"),
-        ({"crop_size": 8}, "--crop_size 8: between 16"),
-        ({"quality": 101}, "--quality 101: between 1 and 100"),
-        ({"fps": 0.0}, "--fps 0.0: more than 0"),
-        ({"margin": -0.1}, "--margin -0.1: between 0 and 2"),
-        ({"margin": float("nan")}, "--margin nan: between 0 and 2"),
-        ({"crop_from": "future"}, "--crop_from future: history or sequence"),
+        ({"history": 0}, "--history 0: must be 1 to"),
+        ({"future": 0}, "--future 0: must be 1 to"),
+        ({"stride": 0}, "--stride 0: must be 1 to"),
+        ({"crop_size": 8}, "--crop_size 8: must be 16 to"),
+        ({"quality": 101}, "--quality 101: must be 1 to 100"),
+        ({"fps": 0.0}, "--fps 0.0: must be more than 0"),
+        ({"margin": -0.1}, "--margin -0.1: must be 0 to 2"),
+        ({"margin": float("nan")}, "--margin nan: must be 0 to 2"),
+        ({"crop_from": "future"}, "--crop_from 'future': unknown; valid: history, sequence"),
     ],
 )
 def test_settings_out_of_range(change, message) -> None:
@@ -198,5 +198,5 @@ def test_settings_survive_json() -> None:
 
     settings = SequenceSettings(margin=0.3, crop_from="sequence")
     assert SequenceSettings.from_json(json.loads(json.dumps(settings.to_json()))) == settings
-    with pytest.raises(RequestError, match="settings need the keys"):
+    with pytest.raises(RequestError, match="future: is missing"):
         SequenceSettings.from_json({"history": 70})

@@ -336,7 +336,7 @@ def test_a_library_is_measured_frame_by_frame(dataset: Path, tmp_path: Path) -> 
     [
         (["--baseline", "persistence"], "leave --checkpoints and --baseline out"),
         (["--kind", "grid"], "has no run of kind 'grid'"),
-        (["--max_run_frames", "0"], "1 or more"),
+        (["--max_run_frames", "0"], "--max_run_frames 0: must be 1 to"),
     ],
 )
 def test_a_library_that_cannot_be_measured_is_refused(

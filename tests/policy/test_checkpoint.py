@@ -58,6 +58,14 @@ CHECKPOINT = Checkpoint(
 )
 
 
+TRAINER = {
+    "step": 7,
+    "seconds": 1.5,
+    "optimizer_steps": {"layers.0.weight": 7},
+    "metrics": {"names": ["loss"], "count": 2},
+}
+
+
 def weights() -> dict[str, torch.Tensor]:
     torch.manual_seed(1)
     return make_model("Mlp", CHECKPOINT.config, CHECKPOINT.dims).state_dict()
@@ -67,7 +75,7 @@ def weights() -> dict[str, torch.Tensor]:
 def run(tmp_path: Path) -> Path:
     """A run folder with one checkpoint."""
     trainer = {"exp_avg/layers.0.weight": torch.arange(6.0).reshape(2, 3).T}  # not row by row
-    write_checkpoint(step_folder(tmp_path, 7), CHECKPOINT, weights(), trainer, {"step": 7})
+    write_checkpoint(step_folder(tmp_path, 7), CHECKPOINT, weights(), trainer, TRAINER)
     return tmp_path
 
 
@@ -86,7 +94,7 @@ def test_a_checkpoint_reads_back_as_it_was_written(run: Path) -> None:
         np.testing.assert_array_equal(value, expected)
     assert len(read.content_hash) == 64
     tensors, trainer = read_trainer(read)
-    assert trainer == {"step": 7}
+    assert vars(trainer) == TRAINER
     assert tensors["exp_avg/layers.0.weight"].tolist() == [[0.0, 3.0], [1.0, 4.0], [2.0, 5.0]]
 
 
@@ -162,9 +170,9 @@ def edit_manifest(folder: Path, **changes: object) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"version": 2}, "has version 2, this package reads 1"),
-        ({"schema": "other/checkpoint"}, "is no checkpoint: manifest.json does not say"),
-        ({"sha256": None}, "damaged: manifest.json lists no files"),
+        ({"version": 2}, "version 2, this release reads .* 1"),
+        ({"schema": "other/checkpoint"}, "schema 'other/checkpoint' version 1, this release reads"),
+        ({"sha256": None}, "sha256: must be an object, not null"),
         ({"sha256": {}}, "model.safetensors is missing"),
     ],
 )
@@ -192,7 +200,7 @@ def test_other_folders_are_refused(run: Path, tmp_path: Path) -> None:
     [
         (lambda c: c.update(policy="Gpt"), "unknown policy 'Gpt'"),
         (lambda c: c["config"].update(width=3), "width"),
-        (lambda c: c["spec"].update(horizon=9), "horizon 9"),
+        (lambda c: c["spec"].update(horizon=9), "horizon 9: must be 5 or less"),
         (lambda c: c.pop("acting"), "acting"),
     ],
 )

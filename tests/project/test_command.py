@@ -166,11 +166,37 @@ def test_exit_codes(body: str, code: int, out: str, err: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (code, out, err)
 
 
-def test_other_failures_keep_their_traceback() -> None:
-    done = run("raise ValueError('a bug')")
+@pytest.mark.parametrize(
+    ("body", "problem"),
+    [
+        ("raise ValueError('a bug\\n  in two lines')", "ValueError: a bug in two lines"),
+        ("raise MemoryError", "MemoryError"),
+        ("main()", "RecursionError: maximum recursion depth exceeded"),
+        ("raise KeyError('\\udce9')", "KeyError: '\\udce9'"),
+    ],
+)
+def test_unforeseen_failures_are_one_line_and_a_log_file(
+    body: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    done = run(body)
     assert done.returncode == 1
-    assert done.stderr.startswith("Traceback")
-    assert "ValueError: a bug" in done.stderr
+    assert done.stderr.startswith(f"error: {problem}")
+    assert done.stderr.count("\n") == 1
+    (log,) = (tmp_path / "robo_manip_baselines").iterdir()
+    assert done.stderr.endswith(f"; the traceback is in '{log}'\n")
+    assert "in main\n" in log.read_text()
+
+
+def test_failures_without_a_place_for_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))
+    done = run("import tempfile; tempfile.tempdir = os.devnull; raise ValueError('a bug')")
+    assert done.returncode == 1
+    assert done.stderr == "error: ValueError: a bug; no log file could be written\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

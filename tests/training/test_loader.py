@@ -275,7 +275,7 @@ def test_no_more_than_depth_batches_are_made_ahead(
     [
         ({"rank": 2, "world_size": 2}, "rank 2 of 2 processes"),
         ({"rank": -1}, "rank -1 of 1"),
-        ({"depth": -1}, "depth -1: must be 0 or more"),
+        ({"depth": -1}, "depth -1: must be 0 to"),
     ],
 )
 def test_wrong_arguments(blind: Demonstrations, changes: dict[str, int], message: str) -> None:

@@ -108,8 +108,8 @@ def test_a_batch_that_is_spoilt_spoils_no_other() -> None:
     ("lengths", "sampler", "batch_size", "seed", "message"),
     [
         ([5], "frames", 8, 0, "unknown sampler 'frames' .*valid: episode, frame"),
-        ([5], "frame", 0, 0, "batch_size 0: must be 1 or more"),
-        ([5], "frame", 8, -1, "seed -1: must be 0 or more"),
+        ([5], "frame", 0, 0, "batch_size 0: must be 1 to"),
+        ([5], "frame", 8, -1, "seed -1: must be 0 to"),
         ([], "frame", 8, 0, "at least one episode"),
         ([5, 0], "frame", 8, 0, "each of at least one step"),
     ],

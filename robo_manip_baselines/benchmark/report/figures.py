@@ -57,6 +57,7 @@ _STYLE: Any = {
     "legend.facecolor": "none",
     "legend.framealpha": 0.0,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # a "$" in a condition's title is one
 }
 
 
@@ -81,11 +82,16 @@ class ReportFigure:
     @property
     def inline(self) -> str:
         """SVG element of a page, with identifiers of its own, in the color of the page's text."""
-        svg = self.svg[self.svg.index("<svg") :].replace(INK, "currentColor")
+        svg = self.svg[self.svg.index("<svg") :]
         svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-        svg = re.sub(r'\bid="', f'id="{self.name}-', svg)
-        svg = re.sub(r'href="#', f'href="#{self.name}-', svg)
-        svg = svg.replace("url(#", f"url(#{self.name}-")
+
+        def own(tag: re.Match[str]) -> str:  # tags only: text stays as it is
+            text = tag[0].replace(INK, "currentColor")
+            text = re.sub(r'\bid="', f'id="{self.name}-', text)
+            text = text.replace('href="#', f'href="#{self.name}-')
+            return text.replace("url(#", f"url(#{self.name}-")
+
+        svg = re.sub(r"<[^>]*>", own, svg)
         label = f'role="img" aria-labelledby="{self.name}-title {self.name}-summary"'
         return svg.replace("<svg", f"<svg {label}", 1)
 

@@ -161,7 +161,7 @@ def _csv(value: Value) -> str:
 
 
 def _markdown(text: str) -> str:
-    return re.sub(r"([\\|*_`<>\[\]])", r"\\\1", text)
+    return re.sub(r"([\\|*_`<>\[\]&$~])", r"\\\1", text)
 
 
 _LATEX = {

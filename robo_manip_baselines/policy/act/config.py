@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Interval
 
 from robo_manip_baselines.policy.presets import (
     STATE_ONLY_TRAINING,
     ActionExecution,
+    Chunk,
+    Layers,
     PolicyPreset,
     TrainSettings,
-    require_at_least,
-    require_proportion,
+    Width,
 )
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.ranges import Amount, Fraction, require_ranges
 
 
 @dataclass(frozen=True)
@@ -53,28 +58,25 @@ class ActConfig:
         RequestError: a value that is not valid.
     """
 
-    chunk_size: int = 100
-    hidden_size: int = 512
-    feedforward_size: int = 3200
-    num_heads: int = 8
-    encoder_layers: int = 4
-    decoder_layers: int = 7
-    state_layers: int = 0
-    latent_size: int = 32
-    cvae_layers: int = 4
+    chunk_size: Chunk = 100
+    hidden_size: Width = 512
+    feedforward_size: Width = 3200
+    num_heads: Annotated[int, Interval(ge=1, le=1024)] = 8
+    encoder_layers: Layers = 4
+    decoder_layers: Layers = 7
+    state_layers: Annotated[int, Interval(ge=0, le=256)] = 0
+    latent_size: Width = 32
+    cvae_layers: Layers = 4
     use_cvae: bool = True
-    kl_weight: float = 10.0
-    dropout: float = 0.1
+    kl_weight: Amount = 10.0
+    dropout: Fraction = 0.1
     pre_norm: bool = False
-    backbone_learning_rate_factor: float = 1.0
+    backbone_learning_rate_factor: Amount = 1.0
     backbone_weights: str | None = None
     paper_compat: bool = False
 
     def __post_init__(self) -> None:
-        require_at_least(1, self, "chunk_size", "hidden_size", "feedforward_size", "num_heads")
-        require_at_least(1, self, "encoder_layers", "decoder_layers", "latent_size", "cvae_layers")
-        require_at_least(0, self, "state_layers", "kl_weight", "backbone_learning_rate_factor")
-        require_proportion(self, "dropout")
+        require_ranges(self)
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")

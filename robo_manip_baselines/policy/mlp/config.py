@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from robo_manip_baselines.policy.presets import (
     STATE_ONLY_TRAINING,
     ActionExecution,
+    Chunk,
+    Layers,
     PolicyPreset,
-    require_at_least,
-    require_proportion,
+    Width,
 )
+from robo_manip_baselines.runs.ranges import Fraction, require_ranges
 
 
 @dataclass(frozen=True)
@@ -27,14 +29,13 @@ class MlpConfig:
         RequestError: a value that is not valid.
     """
 
-    chunk_size: int = 30
-    hidden_size: int = 512
-    hidden_layers: int = 3
-    dropout: float = 0.0
+    chunk_size: Chunk = 30
+    hidden_size: Width = 512
+    hidden_layers: Layers = 3
+    dropout: Fraction = 0.0
 
     def __post_init__(self) -> None:
-        require_at_least(1, self, "chunk_size", "hidden_size", "hidden_layers")
-        require_proportion(self, "dropout")
+        require_ranges(self)
 
 
 PRESETS = {

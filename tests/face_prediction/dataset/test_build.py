@@ -229,7 +229,7 @@ def test_one_video_of_two_people_is_refused(folder, caplog) -> None:
     ("options", "message"),
     [
         (("--folds", 4), "--folds 4: only 3 subjects have sequences"),
-        (("--folds", 0), "--folds 0: 1 or more"),
+        (("--folds", 0), "--folds 0: must be 1 to 1000"),
         (("--history", 100), "no sequence of 102 frames in 4 clips"),
         (("--margin", -1), "--margin -1.0: between 0 and 2"),
         (("--videos", "absent"), "--videos absent: no such folder"),

@@ -85,7 +85,7 @@ class TestSettings:
         ],
     )
     def test_values_out_of_range_name_the_option(self, name: str, value) -> None:
-        with pytest.raises(RequestError, match=f"--{name} {value}"):
+        with pytest.raises(RequestError, match=f"--{name} '?{value}"):
             PredictorTrainSettings(**{"steps": 1, "batch_size": 1, name: value})
 
 

@@ -206,7 +206,7 @@ def test_a_folder_of_another_run_is_refused(finished, change, words: str) -> Non
         ({"settings": ("size=128",)}, "64 pixels, but this network needs 128"),
         ({"settings": ("width",)}, "--settings width: no value; valid: NAME=VALUE"),
         ({"steps": 0}, "--steps 0"),
-        ({"seed": -1}, "--seed -1: too small; valid: 0 or more"),
+        ({"seed": -1}, "--seed -1: must be 0 to"),
         ({"memory_gb": float("nan")}, "--memory_gb nan"),
         ({"checkpoint_every": 0}, "--checkpoint_every 0"),
         ({"device": "gpu"}, "--device gpu"),

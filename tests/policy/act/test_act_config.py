@@ -27,9 +27,9 @@ def test_the_defaults_are_those_of_table_three_and_of_the_public_code():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"chunk_size": 0}, "chunk_size 0: must be 1 or more"),
-        ({"decoder_layers": 0}, "decoder_layers 0: must be 1 or more"),
-        ({"num_heads": -1}, "num_heads -1: must be 1 or more"),
+        ({"chunk_size": 0}, "chunk_size 0: must be 1 to 10000"),
+        ({"decoder_layers": 0}, "decoder_layers 0: must be 1 to 256"),
+        ({"num_heads": -1}, "num_heads -1: must be 1 to 1024"),
         ({"hidden_size": 510, "num_heads": 2}, "hidden_size 510: must be a multiple of 4"),
         ({"num_heads": 7}, "hidden_size 512: must be a multiple of num_heads 7"),
         ({"dropout": 1.0}, "dropout 1.0: must be 0 or more, less than 1"),

@@ -36,9 +36,10 @@ from robo_manip_baselines.observation import (
     ObservedNames,
     State,
 )
-from robo_manip_baselines.observation.corruption import MAX_SEED, NO_PREDICTION
+from robo_manip_baselines.observation.corruption import NO_PREDICTION
 from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
+from robo_manip_baselines.runs.ranges import MAX_SEED
 
 Floats = NDArray[np.float64]
 
