@@ -266,7 +266,11 @@ def test_a_damaged_motion_library_is_refused_by_name(tmp_path: Path) -> None:
     folder = tmp_path / "here"
     folder.mkdir()
     arguments = ["FeedingEnv", "--scripted", "--cameras", "none"]
-    refused([*arguments, "--motion_library", str(library)], "motion.npz' damaged or not an .npz file", folder)
+    refused(
+        [*arguments, "--motion_library", str(library)],
+        "motion.npz': damaged or not an .npz",
+        folder,
+    )
 
 
 def refused(
