@@ -15,8 +15,9 @@ from robo_manip_baselines.data.demonstrations import Demonstrations, load_demons
 from robo_manip_baselines.data.example import make_arrays, make_attributes, make_images
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.memory import free_memory
 from robo_manip_baselines.training import images as images_module
-from robo_manip_baselines.training.images import ImageStore, fit_image, free_memory
+from robo_manip_baselines.training.images import ImageStore, fit_image
 
 # Not the order in which files keep them.
 CAMERAS = ("top", "angle", "front_close")
