@@ -10,14 +10,13 @@ Importing this module imports no network: classes are named, and loaded when the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.memory import available_memory
+from robo_manip_baselines.runs.memory import free_memory
 
 if TYPE_CHECKING:
     from robo_manip_baselines.policy.interface import PolicyModel
@@ -100,32 +99,38 @@ def make_model(name: str, config: Any, dims: PolicyDims) -> PolicyModel:
         RequestError: there is no such policy, its settings do not fit the dimensions, or the
             network does not fit into memory.
     """
-    make = load_part(policy_entry(name).model)
-    _require_memory(name, make, config, dims)
-    return make(config, dims)
+    require_memory(name, config, dims)
+    return load_part(policy_entry(name).model)(config, dims)
 
 
-def _require_memory(
-    name: str, make: Callable[[Any, PolicyDims], PolicyModel], config: Any, dims: PolicyDims
-) -> None:
-    """Raise RequestError if the weights need more than the machine has.
+def require_memory(name: str, config: Any, dims: PolicyDims, copies: int = 1) -> None:
+    """Require the weights of a network to fit into free memory, before they are made.
 
-    Where a rough bound from the settings does not rule that out, the network is built once without
+    Where a rough bound from the settings does not show it, the network is built once without
     memory, on PyTorch's device ``meta``, which takes seconds.
+
+    Args:
+        name: of the policy.
+        config: its settings.
+        dims: of its inputs and outputs.
+        copies: of each weight; training holds the gradient and two moments, too.
+
+    Raises:
+        RequestError: they do not fit.
     """
     sizes = sorted(value for value in vars(config).values() if type(value) is int)
-    there = available_memory()
-    if 16 * math.prod(sizes[-2:]) * max(sum(sizes[:-2]), 1) <= there:
+    there = free_memory()
+    if 16 * copies * math.prod(sizes[-2:]) * max(sum(sizes[:-2]), 1) <= there:
         return
     import torch
 
     try:
         with torch.device("meta"):
-            model = make(config, dims)
+            model = load_part(policy_entry(name).model)(config, dims)
     except (NotImplementedError, RuntimeError):  # a network that needs numbers to be built
         return
     parameters = sum(parameter.numel() for parameter in model.parameters())
-    needed = 4 * parameters
+    needed = 4 * copies * parameters
     if needed > there:
         raise RequestError(
             f"a network of {parameters:,} parameters needs {needed / 2**30:.1f} GiB, and "

@@ -30,13 +30,15 @@ from typing_extensions import is_typeddict
 from robo_manip_baselines.runs.errors import RequestError
 
 if typing.TYPE_CHECKING:
-    from pydantic import TypeAdapter
-    from pydantic_core import ErrorDetails
+    from pydantic_core import ErrorDetails, SchemaValidator
 
 Kind = TypeVar("Kind")
 
 MAX_DEPTH = 64
 """Deepest nesting; the deepest document of the package is 8 deep."""
+
+MAX_NAMES = 10_000
+"""Most names of an object."""
 
 MAX_BYTES = 16 << 20
 """Default size of a JSON document."""
@@ -146,6 +148,8 @@ def parse_json(text: str, source: str, limit: int = MAX_BYTES) -> Any:
         raise RequestError(f"{source} is damaged: nested more than {MAX_DEPTH} deep")
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(pairs) > MAX_NAMES:
+            raise RequestError(f"{source} is damaged: an object with more than {MAX_NAMES} names")
         names = dict(pairs)
         if len(names) < len(pairs):
             seen: set[str] = set()
@@ -284,6 +288,8 @@ class _YamlReader:
     def _begin(self, event: Any) -> None:
         if event.value in self._open[-1]:
             raise self._problem(event, f"{shown(event.value)} is there twice")
+        if len(self._open[-1]) == MAX_NAMES:
+            raise self._problem(event, f"a mapping with more than {MAX_NAMES} names")
         if event.value == "<<" and event.implicit[0]:
             raise self._problem(event, "'<<' is not read; write the values out")
         self._names[-1] = event.value
@@ -434,12 +440,12 @@ def convert(
         # As JSON once more: only there a strict conversion takes lists for tuples.
         text = json.dumps([value], ensure_ascii=False)
         private = text.translate(_TO_PRIVATE)
-        result = _adapter(kind).validate_json(private)[0]
+        result = _validator(kind).validate_json(private)[0]
         if private != text:
             result = _with_bytes(result)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        _, *place = first["loc"]
+        place = list(first["loc"][1:])
         while place and tuple(place) not in (lines or {}):
             place.pop()
         line = f", line {lines[tuple(place)]}" if lines and place else ""
@@ -475,13 +481,25 @@ def shortened(message: object, length: int = _SHOWN) -> str:
 
 
 @cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
+def _validator(kind: Any) -> SchemaValidator:
     from pydantic import ConfigDict, TypeAdapter
+    from pydantic_core import SchemaValidator
 
     # Dataclasses take their settings from what holds them: a tuple of one.
     settings = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     wrapped: Any = types.GenericAlias(tuple, (kind,))
-    return TypeAdapter(wrapped, config=settings)
+    adapter = TypeAdapter(wrapped, config=settings)
+    return SchemaValidator(_ending_early(adapter.core_schema))
+
+
+def _ending_early(schema: Any) -> Any:
+    """Return a schema whose lists end with their first problem: a million would take gigabytes."""
+    if isinstance(schema, list):
+        return [_ending_early(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    parts = {name: _ending_early(part) for name, part in schema.items()}
+    return parts | {"fail_fast": True} if schema.get("type") in ("list", "tuple") else parts
 
 
 def _with_bytes(value: Any) -> Any:
@@ -500,7 +518,7 @@ def _with_bytes(value: Any) -> Any:
 
 def _problem(kind: Any, error: ErrorDetails) -> str:
     """Return a line about the first problem of a document."""
-    _, *place = error["loc"]
+    place = list(error["loc"][1:])
     given = error.get("ctx", {}).items()
     context = {k: f"{v:g}" if isinstance(v, float) else v for k, v in given}
     template = ""

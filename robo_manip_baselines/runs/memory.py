@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import os
+from contextlib import suppress
 from pathlib import Path
 
-_MEMINFO = Path("/proc/meminfo")
+UNKNOWN_MEMORY = 4 * 2**30
+"""Bytes assumed to be free where the system does not report it."""
 
 
-def available_memory() -> int:
-    """Return the bytes that a process can still take, without swapping.
-
-    Where the kernel does not say, it is all memory of the machine.
-    """
-    if _MEMINFO.is_file():
-        for line in _MEMINFO.read_text(encoding="ascii").splitlines():
-            name, _, rest = line.partition(":")
-            if name == "MemAvailable":
-                return int(rest.split()[0]) * 1024
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+def free_memory() -> int:
+    """Return the bytes of memory that are free, or that the container has left, if that is less."""
+    free = [UNKNOWN_MEMORY]
+    with suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        free = [next(1024 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable:"))]
+    with suppress(OSError, ValueError):  # "max", no number, where there is no limit
+        limit, used = (
+            int(Path(f"/sys/fs/cgroup/memory.{name}").read_text(encoding="ascii"))
+            for name in ("max", "current")
+        )
+        free.append(max(limit - used, 0))
+    return min(free)

@@ -10,7 +10,7 @@ import os
 import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +21,13 @@ from robo_manip_baselines.data.episode import EpisodeFileError, EpisodeReader
 from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import decode_image
+from robo_manip_baselines.runs.memory import free_memory
 from robo_manip_baselines.runs.progress import track
 
 Images = NDArray[np.uint8]
 
 MAX_OPEN_FILES = 256
 """Episode files open at a time; the usual limit of a process is 1024 files of all kinds."""
-
-UNKNOWN_MEMORY = 4 * 2**30
-"""Bytes assumed to be free where the system does not report it."""
 
 
 class ImageStore(AbstractContextManager["ImageStore"]):
@@ -149,21 +147,6 @@ class ImageStore(AbstractContextManager["ImageStore"]):
         for _ in track(done, len(numbers), "episode", "decoding images"):
             pass
         return held
-
-
-def free_memory() -> int:
-    """Return the bytes of memory that are free, or that the container has left, if that is less."""
-    free = [UNKNOWN_MEMORY]
-    with suppress(OSError, ValueError, StopIteration):
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        free = [next(1024 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable:"))]
-    with suppress(OSError, ValueError):  # "max", no number, where there is no limit
-        limit, used = (
-            int(Path(f"/sys/fs/cgroup/memory.{name}").read_text(encoding="ascii"))
-            for name in ("max", "current")
-        )
-        free.append(max(limit - used, 0))
-    return min(free)
 
 
 def processors() -> int:

@@ -23,7 +23,7 @@ from robo_manip_baselines.policy.checkpoint import (
     without_initial_weights,
 )
 from robo_manip_baselines.policy.interface import PolicyDims, PolicyModel
-from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
+from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry, require_memory
 from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import (
@@ -88,7 +88,11 @@ class TrainSetup:
         normalization = normalize(given.state[rows], given.action[rows])
         lengths = given.lengths[train]
         sampler = ExampleSampler(lengths, settings.sampler, settings.batch_size, seed)
-        return cls(config, given, split, normalization, sampler, sampler.total_steps(settings))
+        total = sampler.total_steps(settings)
+        setup = cls(config, given, split, normalization, sampler, total)
+        network = without_initial_weights(config.network)
+        require_memory(config.policy, network, setup.dims, copies=4)
+        return setup
 
     @property
     def dims(self) -> PolicyDims:

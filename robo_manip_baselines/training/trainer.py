@@ -22,6 +22,7 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import pip_install
 from robo_manip_baselines.runs.files import locked, require_out_folder
 from robo_manip_baselines.runs.interrupt import StopRequest
+from robo_manip_baselines.runs.memory import free_memory
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import derive_seed
@@ -35,7 +36,7 @@ from robo_manip_baselines.training.device import (
     describe_device,
     prepare_device,
 )
-from robo_manip_baselines.training.images import ImageStore, free_memory
+from robo_manip_baselines.training.images import ImageStore
 from robo_manip_baselines.training.setup import TrainSetup
 from robo_manip_baselines.training.state import (
     TrainerState,

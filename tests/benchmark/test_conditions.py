@@ -142,6 +142,18 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
             "- {name: current_pred_h2, expert: anticipatory}",
             ["line 3", "of the paper", "another name"],
         ),
+        ('- {name: a, title: "a\\nb"}', ["line 3", "title 'a\\nb': must be one line"]),
+        ("- {name: a, title: 3}", ["line 3", "title: must be text, not 3"]),
+        ("- {name: a, name: b}", ["line 3", "'name' is there twice"]),
+        (
+            "- {name: a, horizon: 2026-01-31}",
+            ["line 3", "must be a whole number, not '2026-01-31'"],
+        ),
+        ("- {name: a, delay: " + "9" * 5000 + "}", ["line 3", "of more than 64 bits"]),
+        ("- {name: a, detector_rate: .nan}", ["line 3", "no finite number"]),
+        ("- &a {name: a, title: *a}", ["line 3", "anchors and aliases are not read"]),
+        ("- " * 100_000, ["line 3", "nested more than 64 deep"]),
+        ("- [[[a]]]", ["line 3", "must be an object, not a list of 1"]),
         ("[]", ["conditions: must have 1 elements or more"]),
     ],
 )

@@ -201,7 +201,40 @@ def test_other_folders_are_refused(run: Path, tmp_path: Path) -> None:
         (lambda c: c.update(policy="Gpt"), "unknown policy 'Gpt'"),
         (lambda c: c["config"].update(width=3), "width"),
         (lambda c: c["spec"].update(horizon=9), "horizon 9: must be 5 or less"),
-        (lambda c: c.pop("acting"), "acting"),
+        (lambda c: c.pop("acting"), "acting: is missing"),
+        (lambda c: c.update(acting=[1]), "acting: must be an object, not a list of 1"),
+        (lambda c: c["acting"].update(execute=0), "n_action_steps 0: must be 1 or more"),
+        (lambda c: c["acting"].update(execute="3"), "n_action_steps: must be a whole number"),
+        (lambda c: c["acting"].update(decay=None), "ensemble_decay: must be a number"),
+        (lambda c: c.update(dataset=[1]), "dataset: must be an object"),
+        (lambda c: c["dataset"].update(env_kwargs=[]), "dataset.env_kwargs: must be an object"),
+        (lambda c: c["dataset"].update(colour=1), "dataset: unknown name 'colour'"),
+        (lambda c: c["sizes"].update(state=-3), "sizes.state -3: must be 1 or more"),
+        (
+            lambda c: c["sizes"].update(state=10**10),
+            "sizes.state 10000000000: must be 4096 or less",
+        ),
+        (lambda c: c["sizes"].update(state=4), "'state_mean' has 3 elements, the network 4"),
+        (lambda c: c["sizes"].update(action=1), "'action_mean' has 2 elements, the network 1"),
+        (lambda c: c["sizes"].update(image=[480]), r"sizes.image\[1\]: is missing"),
+        (lambda c: c["sizes"].update(cameras=True), "sizes.cameras: must be a whole number"),
+        (
+            lambda c: c["config"].update(hidden_size=10**10),
+            "hidden_size 10000000000: must be 65536",
+        ),
+        (lambda c: c["config"].update(hidden_size=10**400), "of more than 64 bits"),
+        (lambda c: c["config"].update(dropout=float("nan")), "NaN is no finite number"),
+        (lambda c: c["settings"].update(weight_decay=-1), "settings.weight_decay -1: must be"),
+        (lambda c: c["settings"].update(schedule=3), "settings.schedule: must be text, not 3"),
+        (lambda c: c.update(action_names=[1, 2]), r"action_names\[0\]: must be text, not 1"),
+        (lambda c: c.update(action_names="ab"), "action_names: must be a list, not 'ab'"),
+        (lambda c: c.update(control_period=0), "control_period 0: must be more than 0"),
+        (lambda c: c.update(step=-1), "step -1: must be 0 or more"),
+        (lambda c: c.update(train_seed=2**63 - 1), "train_seed 9223372036854775807: must be"),
+        (lambda c: c.update(policy=["Mlp"]), "policy: must be text, not a list of 1"),
+        (lambda c: c.update(split={"train": [0], "validation": [0]}), "none in both parts"),
+        (lambda c: c.update(spec={"horizon": 2, "cameras": [[1]]}), r"cameras\[0\]: must be text"),
+        (lambda c: c.update(versions={"torch": 2}), "versions.torch: must be text, not 2"),
     ],
 )
 def test_a_configuration_that_does_not_fit_is_refused(
@@ -218,6 +251,25 @@ def test_a_configuration_that_does_not_fit_is_refused(
     with pytest.raises(RequestError, match=message) as caught:
         read_checkpoint(run / "other")
     assert "does not fit this package" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["config.json", "stats.json", "trainer.json", "manifest.json"])
+@pytest.mark.parametrize(
+    "content",
+    [b"[" * 100_000, b"[]", b"3", b"null", b"\xff", b"", b'{"a": 1, "a": 2}', b"9" * 5000, b"{}"],
+)
+def test_documents_that_are_none_are_refused_by_name(run: Path, name: str, content: bytes) -> None:
+    folder = run / "checkpoints" / "step_00000007"
+    with checkpoint_folder(run / "other") as other:
+        for file in FILES:
+            shutil.copy(folder / file, other)
+        if name != "manifest.json":
+            (other / name).write_bytes(content)
+    if name == "manifest.json":
+        (run / "other" / name).write_bytes(content)
+    with pytest.raises(RequestError, match=name) as caught:
+        read_trainer(read_checkpoint(run / "other"))
+    assert len(str(caught.value)) < 600
 
 
 def test_weights_of_another_shape_are_refused(run: Path) -> None:

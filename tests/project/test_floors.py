@@ -126,3 +126,19 @@ def test_one_module_opens_each_kind_of_array_file(pattern: str, repository: Path
         if re.search(pattern, path.read_text(encoding="utf-8"))
     }
     assert found == {OPENERS[pattern]}
+
+
+def test_documents_are_read_in_one_place(repository: Path) -> None:
+    """Nothing but ``runs/documents.py`` parses JSON or YAML."""
+    parsers = {("json", "load"), ("json", "loads"), ("json", "JSONDecoder")}
+    parsers |= {("yaml", name) for name in ("load", "safe_load", "load_all", "compose", "parse")}
+    found = {
+        path.relative_to(repository).as_posix()
+        for package in FLOORS
+        for path in (repository / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and (node.value.id, node.attr) in parsers
+    }
+    assert found == {"robo_manip_baselines/runs/documents.py"}

@@ -194,3 +194,36 @@ def test_folders_that_are_not_ours_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RequestError, match="cannot write"), open_file(tmp_path / "file" / "below"):
         pass
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        (MANIFEST, None, "evaluation.json': it is a folder, pipe or device"),
+        (RESULTS, None, "results.jsonl': it is a folder, pipe or device"),
+        (MANIFEST, "[" * 100_000, "nested more than 64 deep"),
+        (MANIFEST, "NaN", "NaN is no finite number"),
+        (MANIFEST, "[]", "must be an object, not a list of 0"),
+        (MANIFEST, "\udcff", "no UTF-8 at byte 0"),
+        (RESULTS, "NaN\n", "line 1: NaN is no finite number; remove that line"),
+        (RESULTS, "3\n", "line 1: must be an object, not 3"),
+        (RESULTS, "\n", "line 1 is damaged"),
+        (RESULTS, "[" * 100_000 + "\n", "line 1 is damaged: nested more than 64 deep"),
+        (RESULTS, '{"env": 3}\n', "line 1: env: must be text, not 3"),
+        (RESULTS, "\udcff\n", "line 1 is damaged: no UTF-8"),
+    ],
+)
+def test_documents_that_are_none_are_refused(
+    tmp_path: Path, name: str, content: str | None, message: str
+) -> None:
+    with open_file(tmp_path) as file:
+        file.append(MISS)
+    (tmp_path / name).unlink()
+    if content is None:
+        (tmp_path / name).mkdir()
+    else:
+        (tmp_path / name).write_text(content, encoding="utf-8", errors="surrogateescape")
+    with pytest.raises(RequestError) as caught, open_file(tmp_path):
+        pass
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -16,8 +16,9 @@ from robo_manip_baselines.data.example import make_arrays, make_attributes, make
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.memory import free_memory
 from robo_manip_baselines.training import images as images_module
-from robo_manip_baselines.training.images import ImageStore, free_memory
+from robo_manip_baselines.training.images import ImageStore
 
 # Not the order in which files keep them.
 CAMERAS = ("top", "angle", "front_close")
