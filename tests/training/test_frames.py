@@ -94,7 +94,7 @@ def test_an_image_that_is_none_names_the_frame(tmp_path: Path) -> None:
     loaded = load_demonstrations(tmp_path, ObservationSpec(cameras=("top",), image_size=(24, 32)))
     with (
         ImageStore(loaded, memory_budget=0) as source,
-        pytest.raises(RequestError, match="frame 2 of 'top' .*: no image"),
+        pytest.raises(RequestError, match=r"frame 2 of 'top' .*: no image"),
     ):
         source.images(np.arange(4))
 
