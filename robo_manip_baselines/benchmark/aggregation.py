@@ -152,11 +152,18 @@ def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
 
 
 def _remove_earlier(out: Path, written: Sequence[Path]) -> None:
-    """Remove tables and figures of an earlier, different benchmark, by its list of them."""
-    earlier = read_json(out / CONFIGS).get("files", []) if (out / CONFIGS).exists() else []
-    for path in (out / name for name in earlier):
-        if path.parent in (out / TABLES, out / FIGURES) and path not in written:
-            path.unlink(missing_ok=True)
+    """Remove tables and figures of an earlier, different benchmark, by its list of them.
+
+    Earlier releases kept none: then these are all files of the formats that are written.
+    """
+    record = read_json(out / CONFIGS) if (out / CONFIGS).exists() else {}
+    suffixes = {path.suffix for path in written}
+    for folder in (out / TABLES, out / FIGURES):
+        for path in folder.iterdir() if folder.is_dir() else ():
+            name = path.relative_to(out).as_posix()
+            is_ours = name in record["files"] if "files" in record else path.suffix in suffixes
+            if is_ours and path not in written:
+                path.unlink()
 
 
 def _is_benchmark(folder: Path) -> bool:
