@@ -28,6 +28,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
 )
 from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.runs.documents import parse_json
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import CODECS, MAX_SIDE
 from robo_manip_baselines.runs.npz import add_array
 
@@ -262,7 +263,12 @@ def loaded_attribute(item: Attribute, value: Any) -> Any:
         value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
         if isinstance(value, bytes | str):
             text = value.decode() if isinstance(value, bytes) else value
-            return text if item.kind == "text" else parse_json(text, f"attribute '{item.name}'")
+            if item.kind == "text":
+                return text
+            try:
+                return parse_json(text, f"attribute '{item.name}'")
+            except RequestError as error:
+                raise ValueError(error) from None
     elif isinstance(value, np.generic):
         kinds = {"bool": "b", "int": "i", "float": "f"}
         if value.dtype.kind == kinds[item.kind]:

@@ -266,7 +266,7 @@ class EvaluationPlan:
             "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),
             "settings": settings,
         }
-        return json.loads(json.dumps(origin))
+        return as_json(origin)
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from inspect import signature
+from inspect import Parameter, signature
 from typing import Any, Literal, Protocol
 
 import gymnasium
@@ -365,7 +365,11 @@ def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
     unknown = sorted(str(name) for name in kwargs if name not in ENV_ARGUMENTS)
     if unknown and task is not None:
         known = signature(load_part(task.env)).parameters
-        unknown = [name for name in unknown if name not in known]
+        unknown = [
+            name
+            for name in unknown
+            if name not in known or known[name].kind is Parameter.VAR_KEYWORD
+        ]
     if unknown:
         return f"has '{unknown[0][:80]}', which is no argument of the environment"
     for name, value in kwargs.items():
