@@ -85,7 +85,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> int:
     """
     require_fold_options(options.folds, options.seed)
     require_out_folder(options.out, DATASET, [*options.tracks, *options.videos])
-    with locked(options.out):
+    with locked(options.out, is_kept=False):
         return _build_dataset(options)
 
 

@@ -93,7 +93,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
         RequestError: dataset, checkpoints and options do not go together.
     """
     check_evaluate_options(options)
-    with locked(options.out):
+    with locked(options.out, is_kept=False):
         return _evaluate(options)
 
 

@@ -223,7 +223,7 @@ def collect(collection: Collection) -> CollectionSummary:
     with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
         _require_fitting_expert(collection, env)
         _refuse_other_settings(collection, world_of(env).xml_hash)
-        with locked(collection.out):
+        with locked(collection.out, is_kept=False):
             return _collect(collection, env)
 
 

@@ -358,7 +358,7 @@ def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummar
     plan.make_policy(1)
     require_evaluation_folder(plan.out, plan.settings)
     logger.info("%s", plan)
-    with locked(plan.out):
+    with locked(plan.out, is_kept=False):
         return plan, *_evaluate(plan)
 
 

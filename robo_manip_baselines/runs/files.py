@@ -204,15 +204,16 @@ def prepare_folder(folder: str | Path) -> Path:
 
 
 @contextmanager
-def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
+def locked(folder: Path, *, wait: bool = False, is_kept: bool = True) -> Iterator[None]:
     """Hold a folder for this process; a killed process holds nothing.
 
     It has the file ``.lock`` from then on. After a request that is refused, the file is removed if
-    it is new, and so is the folder.
+    it is new, and so is a folder that was made for it.
 
     Args:
         folder: to be written.
         wait: wait for another process that holds the folder, instead of refusing.
+        is_kept: whether the file stays in the folder at the end.
 
     Raises:
         RequestError: another process holds it, or it cannot be written to.
@@ -225,6 +226,9 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
             if is_new:
                 lock.unlink(missing_ok=True)
             raise
+        finally:
+            if not is_kept:
+                lock.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -489,7 +493,7 @@ def _require_writable(folder: Path, out: Path, option: str) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise _not_writable(folder, error) from error
+        raise _not_writable(out, error) from error
 
 
 def _is_alive(process: int) -> bool:

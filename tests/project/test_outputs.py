@@ -126,7 +126,7 @@ SUFFIXES = {"export-motion --report": ".md", "export-stats": ".json"} | dict.fro
         ("foreign.mp4/x*", "'foreign.mp4' is no folder"),
         ("pipe.mp4", "a device or a pipe"),
         ("/dev/null", "a device or a pipe"),
-        ("/proc/x*", "cannot write to '/proc'"),
+        ("/proc/x*", "cannot write to '/proc/x"),
         ("a" * 300 + "*", "File name too long"),
     ],
 )
@@ -160,7 +160,7 @@ def test_nothing_is_written_among_the_inputs(there: Path, command: str) -> None:
         (".", "holds"),
         ("/dev/null", "is a file"),
         ("pipe.mp4", "is a file"),
-        ("/proc/x", "cannot write to '/proc'"),
+        ("/proc/x", "cannot write to '/proc/x"),
         ("a" * 300, "File name too long"),
     ],
 )
