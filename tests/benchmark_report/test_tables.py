@@ -52,7 +52,7 @@ def test_markdown() -> None:
     assert to_markdown(SMALL) == (
         "**50 % of a\\_b \\| c**\n"
         "\n"
-        "| Name | Rate & more |\n"
+        "| Name | Rate \\& more |\n"
         "| --- | --: |\n"
         "| a\\_1 \\| \\<b\\> | **−3.5 ± 1** |\n"
         "| 50% {x}\\\\y~^ | – |\n"

@@ -214,7 +214,7 @@ def test_wrong_actions_get_one_clear_line(name: str, action: Any, message: str) 
 def test_wrong_seeds_are_refused(name: str, seed: Any) -> None:
     with (
         contextlib.closing(make_env(name, cameras=())) as env,
-        pytest.raises(RequestError, match=r"^seed .*: must be 0 to 9223372036854775807"),
+        pytest.raises(RequestError, match=r"^seed .*: must be 0 to 9007199254740991"),
     ):
         env.reset(seed=seed)
 
@@ -226,7 +226,7 @@ def test_integers_of_numpy_are_seeds(name: str) -> None:
             again, _ = env.reset(seed=seed)  # type: ignore[arg-type]
             np.testing.assert_array_equal(again["state"], first["state"])
             np.testing.assert_array_equal(env.unwrapped.vector, first["state"])
-        env.reset(seed=2**63 - 1)
+        env.reset(seed=MAX_SEED)
 
 
 def test_options_of_an_episode_are_not_ignored(name: str) -> None:
@@ -336,11 +336,11 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
         ({"corruption": {"delay": 3}}, "shows nothing"),
         ({"corruption": "uniform"}, r"corruption 'uniform': .*\{'error': 'uniform'\}"),
         ({"corruption": ["uniform"]}, r"corruption \['uniform'\]: .*\{'error': 'uniform'\}"),
-        ({"corruption": {"delay": "3"}}, "delay '3': must be 0 to"),
+        ({"corruption": {"delay": "3"}}, "delay: must be a whole number, not '3'"),
         ({"corruption": {"delay": float("nan")}}, "delay nan: must be 0 to"),
         ({"corruption": {"face_dropout": "a"}}, "face_dropout 'a': must be a number"),
         ({"corruption": {"seed": 1.5}}, "seed of the corruption 1.5: must be 0 to"),
-        ({"corruption": {"sped": 1}}, "unknown setting of the corruption 'sped'"),
+        ({"corruption": {"sped": 1}}, "corruption: unknown name 'sped'"),
         ({"arms": "left"}, "unknown arms 'left'; valid: both, right"),
         ({"arms": None}, "unknown arms 'None'; valid: both, right"),
         ({"face_motion": "never"}, "unknown face motion 'never'"),

@@ -28,7 +28,7 @@ from face_prediction.tracking.detector import (
 )
 from face_prediction.tracking.tracks import load_track, save_track
 from face_prediction.tracking.video import VideoReader
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, WriteError
 
 
 def picture(left: int | None) -> np.ndarray:
@@ -188,7 +188,7 @@ def test_a_full_disk_ends_the_batch_with_whole_files(
         write(stream, **arrays)
 
     monkeypatch.setattr(np, "savez_compressed", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(WriteError, match="No space left"):
         run(*videos)
     assert StandIn.looked == 10  # the third video is not begun
     assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["a.npz"]

@@ -249,7 +249,7 @@ def test_bad_requests_get_one_line_and_exit_code_2(
     ("environment", "message"),
     [
         # No device at that number: as where no driver is installed, EGL gives no display.
-        ({"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "99"}, "apt-get install"),
+        ({"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "99"}, "no such EGL device"),
         ({"MUJOCO_GL": "crayon"}, "MUJOCO_GL=crayon renders nothing; valid: egl, osmesa, glfw"),
         ({"MUJOCO_GL": "disable"}, "--cameras none"),
     ],
