@@ -13,9 +13,11 @@ import math
 from collections import deque
 from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -25,7 +27,7 @@ from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.ranges import Count, NonNegativeInt, Seed, require_range
+from robo_manip_baselines.runs.ranges import Count, NonNegativeInt, require_range
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.images import ImageStore
 
@@ -65,7 +67,7 @@ class ExampleSampler:
         self.batch_size = batch_size
         self.seed = seed
         require_range("batch_size", batch_size, Count)
-        require_range("seed", seed, Seed)
+        require_range("seed", seed, Annotated[int, Interval(ge=0, le=2**63 - 1)])  # perhaps derived
         if self.lengths.ndim != 1 or not self.lengths.size or self.lengths.min() < 1:
             raise RequestError("training needs at least one episode, each of at least one step")
         by_episode = sampler == "episode"

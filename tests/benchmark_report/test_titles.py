@@ -58,9 +58,9 @@ def test_the_report_shows_titles_as_they_are(titled: BenchmarkStatistics) -> Non
 
 
 def test_tables_hold_titles_as_they_are(titled: BenchmarkStatistics) -> None:
-    table = benchmark_tables(titled)[0]
+    table = next(t for t in benchmark_tables(titled) if t.name == "success")
     cells = {cell for row in csv.reader(io.StringIO(to_csv(table))) for cell in row}
-    assert set(TITLES.values()) <= cells
+    assert set(TITLES) <= cells
     latex, markdown = to_latex(table), to_markdown(table)
     assert r"\_costs \$5\_\{x\} \& 100 \%, \#1" in latex
     assert r"\textbackslash{}alpha \$\textbackslash{}frac\{\$" in latex

@@ -247,7 +247,7 @@ def children_of_group(group: int) -> list[int]:
         ("--num_episodes 10000000000", "num_episodes 10000000000: must be 1 to 1000000"),
         ("--seed -5", "seed -5"),
         ("--seed 9223372036854775807", "seed 9223372036854775807: must be 0 to 9007199254740991"),
-        ("--seed 9007199254740990", "seed + num_episodes - 1 = 9007199254741039: must be 0 to"),
+        ("--seed 9007199254740990", "seed + num_episodes - 1 = 9007199254740992: must be 0 to"),
         ("--device abacus", "device 'abacus'"),
         ("--precision fp8", "unknown precision 'fp8'"),
         ("--clips me", "unknown clip 'me'"),
@@ -300,8 +300,8 @@ def test_wrong_requests_get_one_line_and_exit_code_2(
     [
         ({"xml_hash": "0" * 64}, "trained with model hash 000000000000; FeedingEnv has"),
         (
-            {"action_names": ("left/waist",)},
-            "trained with actions left/waist; FeedingEnv has right",
+            {"action_names": ("left/waist", *"abcdef")},
+            "trained with actions left/waist, a, b, c, d, e, f; FeedingEnv has right",
         ),
         ({"control_period": 0.05}, "trained with control period 0.05; FeedingEnv has 0.02"),
     ],
