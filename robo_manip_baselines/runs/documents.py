@@ -438,11 +438,13 @@ def convert(
 
     try:
         # As JSON once more: only there a strict conversion takes lists for tuples.
-        text = json.dumps([value], ensure_ascii=False)
+        text = json.dumps([value], ensure_ascii=False, default=_plain)
         private = text.translate(_TO_PRIVATE)
         result = _validator(kind).validate_json(private)[0]
         if private != text:
             result = _with_bytes(result)
+    except TypeError as error:
+        raise RequestError(f"{source}: {error}") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = list(first["loc"][1:])
@@ -500,6 +502,13 @@ def _ending_early(schema: Any) -> Any:
         return schema
     parts = {name: _ending_early(part) for name, part in schema.items()}
     return parts | {"fail_fast": True} if schema.get("type") in ("list", "tuple") else parts
+
+
+def _plain(value: Any) -> Any:
+    """Return a number of NumPy, which Python code may give, as Python's; raise TypeError else."""
+    if callable(item := getattr(value, "item", None)) and getattr(value, "ndim", None) == 0:
+        return item()
+    raise TypeError(f"a value of type {type(value).__name__}: must be text, a number or a list")
 
 
 def _with_bytes(value: Any) -> Any:
