@@ -240,7 +240,7 @@ class _ClipReader:
         self._image_size = (int(width), int(height))
 
     def _is_consistent(self, settings: SequenceSettings) -> bool:
-        """Whether starts, crops and images of the sequences point into the arrays."""
+        """Return whether starts, crops and images of the sequences point into the arrays."""
         frames = len(clip_array(self.path, self.file, "frames/valid"))
         stored = len(clip_array(self.path, self.file, "pictures/data"))
         images, sizes = len(self._checksum), np.diff(self._offset)

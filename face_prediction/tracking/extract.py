@@ -151,7 +151,7 @@ class Resampler:
 
 
 def resample(source: Samples, fps: float, max_gap: float = MAX_GAP) -> tuple[Samples, np.ndarray]:
-    """What a `Resampler` makes of ``source``, whole."""
+    """Whole result of a `Resampler` of ``source``."""
     return Resampler(fps, max_gap).add(source, is_last=True)
 
 

@@ -36,7 +36,7 @@ LOGGERS = ("tensorboard", "wandb", "none")
 
 @dataclass(frozen=True)
 class MetricsLine:
-    """What every line of ``metrics.jsonl`` has, beside numbers by name."""
+    """Fields of every line of ``metrics.jsonl``, beside numbers by name."""
 
     __pydantic_config__: ClassVar = IGNORES_OTHERS
 

@@ -112,7 +112,7 @@ OPENERS = {
     r"safetensors\.torch\.load|safe_open|import load_file": "runs/tensors.py",
     r"h5py\.File\(.*\"r\"": "runs/hdf5.py",
 }
-"""What opens a file of arrays -> the one module that may, for it checks sizes before reading."""
+"""Call that opens a file of arrays -> the one module that checks sizes before reading."""
 
 
 @pytest.mark.parametrize("pattern", OPENERS)

@@ -114,7 +114,7 @@ OTHER: dict[str, Mapping[str, Any]] = {
     "training is c{12} .* and f{12}": {"settings": {**SETTINGS, "training": "f" * 64}},
     "settings is recorded .* and not recorded": {"settings": None},
 }
-"""What the message says -> changes of a row."""
+"""Message -> changes of a row."""
 
 
 @pytest.mark.parametrize("name", AGGREGATIONS)

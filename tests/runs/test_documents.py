@@ -167,7 +167,7 @@ def require_one_line(error: RequestError) -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_declared_documents_read_back(name: str) -> None:
-    """What the types declare is read, or breaks a promise between fields; nothing else happens."""
+    """Declared values are read, or break a promise between fields; nothing else happens."""
     kind = KINDS[name]
 
     @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))

@@ -129,7 +129,7 @@ def test_resuming_is_exact(name: str, episodes: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["average, cosine, warm-up, clipped", "images"])
 def test_an_extended_run_is_the_longer_run(name: str, episodes: Path, tmp_path: Path) -> None:
-    """Where the learning rate does not depend on the budget; the old end was a multiple of 3."""
+    """For a learning rate that does not depend on the budget; the old end was a multiple of 3."""
     steady = RUNS[name] + " --schedule constant"
     run(steady, episodes, tmp_path / "whole")
     run(f"{steady} --steps 6", episodes, tmp_path / "parts")

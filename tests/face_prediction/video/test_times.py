@@ -15,7 +15,7 @@ pytestmark = pytest.mark.long
 
 
 def numbers(frames, pattern, count: int) -> list[int]:
-    """Which images of the pattern the frames show, by their brightness."""
+    """Images of the pattern that the frames show, by their brightness."""
     blues = [image[40:, 40:, 2].mean() for image in pattern(count)]
     return [int(np.argmin([abs(f.image[40:, 40:, 2].mean() - b) for b in blues])) for f in frames]
 

@@ -160,7 +160,7 @@ class FaceMotion:
 
     @property
     def is_as_recorded(self) -> bool:
-        """Whether it is a recorded motion unchanged, to which a predictor's forecasts apply."""
+        """True for a recorded motion unchanged, to which a predictor's forecasts apply."""
         return self.parts == (Recorded(),)
 
     def draw(
