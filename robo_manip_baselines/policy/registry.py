@@ -9,7 +9,6 @@ Importing this module imports no network: classes are named, and loaded when the
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
@@ -120,7 +119,8 @@ def require_memory(name: str, config: Any, dims: PolicyDims, copies: int = 1) ->
     """
     sizes = sorted(value for value in vars(config).values() if type(value) is int)
     there = free_memory()
-    if 16 * copies * math.prod(sizes[-2:]) * max(sum(sizes[:-2]), 1) <= there:
+    # A matrix is no larger than the largest setting squared, and of each there are few.
+    if sizes and 16 * copies * sizes[-1] ** 2 * max(sum(sizes[:-1]), 1) <= there:
         return
     import torch
 
