@@ -20,7 +20,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.work_item import (
     LOG,
     MOUNTS,
@@ -142,6 +141,8 @@ def run_evaluation(settings: Mapping[str, Any]) -> None:
 
 def _write_forecast(settings: Mapping[str, Any]) -> None:
     if settings["prediction"] != "truth":
+        from robo_manip_baselines.benchmark.forecasts import write_library  # 0.6 s to import
+
         source = Path(LIBRARY) if Path(LIBRARY).exists() else None
         write_library(Path(FORECAST), source, settings["prediction"])
 
