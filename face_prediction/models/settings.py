@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from annotated_types import Interval
+from annotated_types import Interval, Len
 
 from robo_manip_baselines.runs.documents import as_json, convert
 from robo_manip_baselines.runs.errors import RequestError
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Decay = Literal["constant", "cosine"]
 Precision = Literal["auto", "fp32", "bf16"]
+
+Channels = Annotated[tuple[Annotated[int, Interval(ge=1, le=2048)], ...], Len(1, 8)]
+"""Channels of convolutions, one after another."""
 
 ImageSize = Literal[32, 64, 128, 256]
 """Sides of images that a network can see: 256, and the fractions that JPEG decodes directly."""
@@ -144,11 +147,11 @@ class ApproachSettings(ModelSettings):
     } | {"feedforward": 256, "dropout": 0.0}
 
     size: ImageSize = 256
-    channels: tuple[int, ...] = (32, 64, 128, 256, 256, 256)
-    width: Annotated[int, Interval(ge=2, le=8192)] = 512
+    channels: Channels = (32, 64, 128, 256, 256, 256)
+    width: Annotated[int, Interval(ge=2, le=2048)] = 512
     heads: Annotated[int, Interval(ge=1, le=128)] = 8
-    layers: Annotated[int, Interval(ge=1, le=64)] = 4
-    feedforward: Annotated[int, Interval(ge=1, le=65536)] = 2048
+    layers: Annotated[int, Interval(ge=1, le=16)] = 4
+    feedforward: Annotated[int, Interval(ge=1, le=8192)] = 2048
     dropout: Annotated[float, Interval(ge=0.0, le=0.9)] = 0.1
     history: Annotated[int, Interval(ge=1, le=10_000)] = 70
     horizon: Annotated[int, Interval(ge=1, le=1000)] = 5
@@ -172,7 +175,7 @@ class FusionSettings(ApproachSettings):
 
     cpu: ClassVar[Mapping[str, Any]] = {**ApproachSettings.cpu, "landmark_width": 64}
 
-    landmark_width: Annotated[int, Interval(ge=2, le=8192)] = 256
+    landmark_width: Annotated[int, Interval(ge=2, le=2048)] = 256
     landmark_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 0.5
 
     def __post_init__(self) -> None:
@@ -187,7 +190,7 @@ class CrossAttentionSettings(FusionSettings):
 
     cpu: ClassVar[Mapping[str, Any]] = {**FusionSettings.cpu, "attention_width": 128}
 
-    attention_width: Annotated[int, Interval(ge=1, le=8192)] = 256
+    attention_width: Annotated[int, Interval(ge=1, le=2048)] = 256
 
 
 @dataclass(frozen=True)
@@ -223,8 +226,8 @@ class ResidualSettings(ModelSettings):
     size: ImageSize = 256
     pictures: Annotated[int, Interval(ge=2, le=64)] = 4
     region: Annotated[int, Interval(ge=8, le=256)] = 48
-    channels: tuple[int, ...] = (32, 64, 128)
-    width: Annotated[int, Interval(ge=4, le=4096)] = 128
+    channels: Channels = (32, 64, 128)
+    width: Annotated[int, Interval(ge=4, le=2048)] = 128
     refiner: Annotated[int, Interval(ge=1, le=1024)] = 32
     dropout: Annotated[float, Interval(ge=0.0, le=0.9)] = 0.2
     shapes: Annotated[int, Interval(ge=2, le=64)] = 8

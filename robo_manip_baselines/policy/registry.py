@@ -105,31 +105,18 @@ def make_model(name: str, config: Any, dims: PolicyDims) -> PolicyModel:
 def require_memory(name: str, config: Any, dims: PolicyDims, copies: int = 1) -> None:
     """Require the weights of a network to fit into free memory, before they are made.
 
-    Where a rough bound from the settings does not show it, the network is built once without
-    memory, on PyTorch's device ``meta``, which takes seconds.
-
     Args:
         name: of the policy.
-        config: its settings.
+        config: its settings; their ``num_parameters`` is asked, where they have it.
         dims: of its inputs and outputs.
         copies: of each weight; training holds the gradient and two moments, too.
 
     Raises:
         RequestError: they do not fit.
     """
-    sizes = sorted(value for value in vars(config).values() if type(value) is int)
-    there = free_memory()
-    # A matrix is no larger than the largest setting squared, and of each there are few.
-    if sizes and 16 * copies * sizes[-1] ** 2 * max(sum(sizes[:-1]), 1) <= there:
+    if not hasattr(config, "num_parameters"):
         return
-    import torch
-
-    try:
-        with torch.device("meta"):
-            model = load_part(policy_entry(name).model)(config, dims)
-    except (NotImplementedError, RuntimeError):  # a network that needs numbers to be built
-        return
-    parameters = sum(parameter.numel() for parameter in model.parameters())
+    parameters, there = config.num_parameters(dims), free_memory()
     needed = 4 * copies * parameters
     if needed > there:
         raise RequestError(

@@ -56,6 +56,10 @@ _PLAINER = (
         r"Error parsing (\S+): invalid literal for int\(\).*: ('.*')",
         r"\1 is a whole number, not \2",
     ),
+    (
+        r"Error parsing (\S+): Exceeds the limit .*",
+        r"\1 is a whole number of fewer digits",
+    ),
     (r"Error parsing (\S+): could not convert string to float: ('.*')", r"\1 is a number, not \2"),
     (r"Error parsing (\S+): ", r"\1: "),
     (

@@ -342,7 +342,7 @@ class Schema(NamedTuple):
         if type(version) is not int or (name, version) != self:
             raise RequestError(
                 f"{source}: schema {shown(name)} version {shown(version)}, this release reads "
-                f"'{self.name}' {self.version}; use the release that wrote it, or make it again"
+                f"'{self.name}' {self.version}; use the release that wrote it"
             )
         return rest
 
@@ -529,7 +529,7 @@ def _problem(kind: Any, error: ErrorDetails) -> str:
     """Return a line about the first problem of a document."""
     place = list(error["loc"][1:])
     given = error.get("ctx", {}).items()
-    context = {k: f"{v:g}" if isinstance(v, float) else v for k, v in given}
+    context = {k: f"{v:.15g}" if isinstance(v, float) else v for k, v in given}
     template = ""
     if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         *place, name = place

@@ -33,7 +33,8 @@ Amount = Annotated[float, Interval(ge=0.0)]
 Positive = Annotated[float, Interval(gt=0.0)]
 Fraction = Annotated[float, Interval(ge=0.0, lt=1.0)]
 
-_ANY = Interval(ge=-(1 << 63), lt=1 << 63)
+_INTEGER = Interval(ge=-(1 << 63), lt=1 << 63)
+"""Range of numbers that declare none."""
 
 
 def require_ranges(config: Any, given: str = "{} {}") -> None:
@@ -48,7 +49,7 @@ def require_ranges(config: Any, given: str = "{} {}") -> None:
     Raises:
         RequestError: naming the first number that is not.
     """
-    for name, option, interval in _numbers(type(config)):
+    for name, option, interval in number_fields(type(config)):
         value = getattr(config, name)
         for number in value if isinstance(value, (tuple, list)) else (value,):
             _require(given.format(option, shown(number)), number, interval)
@@ -71,11 +72,11 @@ def require_range(name: str, value: float, kind: Any) -> None:
     _require(f"{name} {shown(value)}", value, _range_of(_parts(kind)))
 
 
-def describe_range(interval: Interval, is_float: bool = False) -> str:
+def describe_range(interval: Interval | None, is_float: bool = False) -> str:
     """Describe a range: ``1 to 5``, ``0 or more, less than 1``, ``more than 0, and finite``."""
-    ge, gt, le, lt = (_plain(end) for end in (interval.ge, interval.gt, interval.le, interval.lt))
-    if interval is _ANY:
+    if interval is None:
         return "finite" if is_float else "of 64 bits"
+    ge, gt, le, lt = (_plain(end) for end in (interval.ge, interval.gt, interval.le, interval.lt))
     if ge is not None and le is not None:
         return f"{ge} to {le}"
     low = f"{ge} or more" if ge is not None else f"more than {gt}" if gt is not None else ""
@@ -84,18 +85,21 @@ def describe_range(interval: Interval, is_float: bool = False) -> str:
     return both if high or not is_float else f"{both}, and finite"
 
 
-def _require(given: str, number: Any, interval: Interval) -> None:
-    if isinstance(number, (int, float)) and not _holds(number, interval):
-        wanted = describe_range(interval, isinstance(number, float))
+def _require(given: str, number: Any, interval: Interval | None) -> None:
+    if not isinstance(number, (int, float)):
+        return
+    is_float = isinstance(number, float)
+    if not _holds(number, interval or (Interval() if is_float else _INTEGER)):
+        wanted = describe_range(interval, is_float)
         raise RequestError(f"{given}: must be {wanted}")
 
 
-def _range_of(parts: Iterable[Any]) -> Interval:
-    return next((part for part in parts if isinstance(part, Interval)), _ANY)
+def _range_of(parts: Iterable[Any]) -> Interval | None:
+    return next((part for part in parts if isinstance(part, Interval)), None)
 
 
 def _plain(end: Any) -> str | None:
-    return None if end is None else f"{end:g}" if isinstance(end, float) else str(end)
+    return None if end is None else f"{end:.15g}" if isinstance(end, float) else str(end)
 
 
 def _holds(number: float, interval: Interval) -> bool:
@@ -110,8 +114,11 @@ def _holds(number: float, interval: Interval) -> bool:
 
 
 @cache
-def _numbers(kind: type) -> list[tuple[str, str, Interval]]:
-    """Return the fields of a dataclass with numbers: name, name on a command line, range."""
+def number_fields(kind: type) -> list[tuple[str, str, Interval | None]]:
+    """Return the fields of a dataclass that hold numbers.
+
+    Each is (name, name on a command line, range); the range is None where none is declared.
+    """
     hints = typing.get_type_hints(kind, include_extras=True)
     found = []
     for item in dataclasses.fields(kind):

@@ -250,8 +250,8 @@ def test_baselines_are_fitted_to_the_others(dataset: Path, monkeypatch) -> None:
         ({"checkpoints": (Path("a"),)}, "either --checkpoints .* or --baseline"),
         ({"baseline": "oracle"}, "unknown baseline 'oracle'; valid: "),
         ({"kind": "grid"}, "no sequence of kind grid in fold 0, 1, 2"),
-        ({"crop_width": -1.0}, "crop_width -1.0; must be above 0"),
-        ({"depth_m": 0.0}, "depth_m 0.0; must be above 0"),
+        ({"crop_width": -1.0}, "crop_width -1.0: must be more than 0, 1000000 or less"),
+        ({"depth_m": 0.0}, "depth_m 0.0: must be more than 0, 1000000 or less"),
         ({"dataset": Path("/nowhere")}, "no dataset"),
     ],
 )

@@ -105,10 +105,10 @@ def test_the_report(folder: Path, run) -> None:
     ("arguments", "message"),
     [
         (("--attribution", "absent.csv"), "absent.csv: cannot be read"),
-        (("--min_run", "-1"), "--min_run -1.0: must be positive"),
-        (("--max_displacement", "0"), "--max_displacement 0.0: must be positive"),
-        (("--max_rotation", "nan"), "--max_rotation nan: must be positive"),
-        (("--depth_cutoff", "0"), "--depth_cutoff 0.0: must be positive"),
+        (("--min_run", "-1"), "--min_run -1.0: must be more than 0, and finite"),
+        (("--max_displacement", "0"), "--max_displacement 0.0: must be more than 0, and finite"),
+        (("--max_rotation", "nan"), "--max_rotation nan: must be more than 0, and finite"),
+        (("--depth_cutoff", "0"), "--depth_cutoff 0.0: must be more than 0, and finite"),
         (("--min_run", "100"), "no run is long enough"),
     ],
 )

@@ -27,7 +27,7 @@ from robo_manip_baselines.runs.errors import RequestError
         ({"face_dropout": 0.94}, "face_dropout 0.94: must be 0 to 0.938.*losses of 15 frames"),
         ({"face_dropout": 0.6, "face_dropout_length": 1.0}, "must be 0 to 0.5"),
         ({"face_dropout": float("nan")}, "face_dropout nan"),
-        ({"face_dropout_length": 0.5}, "face_dropout_length 0.5: must be 1 to 1e"),
+        ({"face_dropout_length": 0.5}, "face_dropout_length 0.5: must be 1 to 1000000"),
         ({"face_dropout_length": float("inf")}, "face_dropout_length inf"),
         ({"detector_rate": 0.0}, "detector_rate 0.0: must be more than 0, 30 or less"),
         ({"detector_rate": 31.0}, "detector_rate 31"),

@@ -12,12 +12,15 @@ from robo_manip_baselines.policy.presets import (
     ActionExecution,
     Chunk,
     Layers,
+    PolicyDims,
     PolicyPreset,
     TrainSettings,
     Width,
 )
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.ranges import Amount, Fraction, require_ranges
+
+RESNET18_PARAMETERS = 11_200_000
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,18 @@ class ActConfig:
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
+
+    def num_parameters(self, dims: PolicyDims) -> int:
+        """Return about how many weights the network has: its matrices, and the ResNet-18."""
+        width, forward = self.hidden_size, self.feedforward_size
+        attention, blocks = 4 * width**2, 2 * width * forward
+        layers = self.encoder_layers + (self.cvae_layers if self.use_cvae else 0)
+        count = layers * (attention + blocks) + self.decoder_layers * (2 * attention + blocks)
+        if self.state_layers:
+            count += (self.state_layers - 1) * forward**2 + forward * (dims.state + width)
+        if dims.cameras:
+            count += RESNET18_PARAMETERS
+        return count + width * (self.chunk_size + 2 * self.latent_size + dims.state + dims.action)
 
 
 PRESETS = {

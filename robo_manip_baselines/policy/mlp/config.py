@@ -9,6 +9,7 @@ from robo_manip_baselines.policy.presets import (
     ActionExecution,
     Chunk,
     Layers,
+    PolicyDims,
     PolicyPreset,
     Width,
 )
@@ -36,6 +37,12 @@ class MlpConfig:
 
     def __post_init__(self) -> None:
         require_ranges(self)
+
+    def num_parameters(self, dims: PolicyDims) -> int:
+        """Return about how many weights the network has."""
+        width = self.hidden_size
+        outputs = self.chunk_size * dims.action
+        return width * (dims.state + (self.hidden_layers - 1) * width + outputs)
 
 
 PRESETS = {

@@ -231,7 +231,7 @@ def test_one_video_of_two_people_is_refused(folder, caplog) -> None:
         (("--folds", 4), "--folds 4: only 3 subjects have sequences"),
         (("--folds", 0), "--folds 0: must be 1 to 1000"),
         (("--history", 100), "no sequence of 102 frames in 4 clips"),
-        (("--margin", -1), "--margin -1.0: between 0 and 2"),
+        (("--margin", -1), "--margin -1.0: must be 0 to 2"),
         (("--videos", "absent"), "--videos absent: no such folder"),
         (("--attribution", "absent.csv"), "absent.csv: cannot be read"),
     ],
@@ -252,4 +252,4 @@ def test_other_folders_are_left_alone(folder, caplog) -> None:
     (out / "precious.txt").unlink()
     (out / "dataset.json").write_text('{"schema": "other", "version": 1}')
     assert folder.run() == 2
-    assert "schema 'other' version 1, expected 'face_dataset' 1" in caplog.text
+    assert "schema 'other' version 1, this release reads 'face_dataset' 1" in caplog.text

@@ -117,8 +117,8 @@ class TestDamage:
     @pytest.mark.parametrize(
         ("key", "value", "words"),
         [
-            ("schema", "other", "schema 'other' version 1, expected 'face_predictor' 1"),
-            ("version", 2, "version 2, expected 'face_predictor' 1"),
+            ("schema", "other", "schema 'other' version 1, this release reads 'face_predictor' 1"),
+            ("version", 2, "version 2, this release reads 'face_predictor' 1"),
             ("model", "gpt", "model 'gpt': unknown; valid: image_only"),
             ("model_sha256", "0", "are of different steps"),
         ],
