@@ -169,7 +169,7 @@ class EvaluationPlan:
         spec = checkpoint.spec
         if config.corruption is not None:
             spec = replace(spec, corruption=config.corruption.pinned())
-        recorded = checkpoint.dataset["env_kwargs"]
+        recorded = checkpoint.dataset.get("env_kwargs", {})
         if "motion_library" in config.env_kwargs:  # another file, of other content perhaps
             recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
         if "motion" in config.env_kwargs and not parse_motion(config.env_kwargs["motion"]).recorded:
@@ -244,7 +244,7 @@ class EvaluationPlan:
             "network": asdict(without_initial_weights(checkpoint.config)),
             "settings": asdict(checkpoint.settings),
             "step": checkpoint.step,
-            "demonstrations": checkpoint.dataset["content_hash"],
+            "demonstrations": checkpoint.dataset.get("content_hash"),
         }
         settings = {
             "env_kwargs": kwargs,

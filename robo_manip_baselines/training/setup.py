@@ -164,7 +164,7 @@ class TrainSetup:
             if not done:
                 state = f"at step {checkpoint.step}; --resume continues it"
             raise RequestError(f"'{run}' holds this run, {state}")
-        if checkpoint.dataset["content_hash"] != self.demonstrations.content_hash:
+        if checkpoint.dataset.get("content_hash") != self.demonstrations.content_hash:
             raise RequestError(
                 f"the demonstrations in '{self.config.demonstrations}' are not the ones that "
                 f"'{run}' was trained on; give those with --dataset, or choose another --out"
