@@ -58,7 +58,7 @@ class LiveOptions:
             window, or with Ctrl-C.
     """
 
-    camera: Annotated[int, Interval(ge=0, le=1000)] | None = None
+    camera: Annotated[int, Interval(ge=0, le=MAX_CAMERAS - 1)] | None = None
     video: Path | None = None
     checkpoint: str = SHIPPED
     dataset: Path | None = None
@@ -114,8 +114,6 @@ def check_live_options(options: LiveOptions) -> None:
     if (options.camera is None) == (video is None):
         raise RequestError("give either --camera NUMBER or --video FILE")
     require_ranges(options, "--{} {}")
-    if options.camera is not None and not 0 <= options.camera < MAX_CAMERAS:
-        raise RequestError(f"--camera {options.camera}: valid: 0 to {MAX_CAMERAS - 1}")
     if video is not None:
         require_video(video)
     if out is None:
