@@ -33,7 +33,7 @@ from robo_manip_baselines.benchmark.work_item import (
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.rollout.results import RESULTS, read_results
-from robo_manip_baselines.runs.documents import read_json
+from robo_manip_baselines.runs.documents import convert, read_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
     FolderKind,
@@ -105,41 +105,30 @@ def write_aggregation(
         command: command line of the benchmark.
     """
     with locked_file(out / CONFIGS, wait=True):
-        _write_aggregation(plan, store, statistics, out, videos, command)
-
-
-def _write_aggregation(
-    plan: Plan,
-    store: ArtifactStore,
-    statistics: BenchmarkStatistics,
-    out: Path,
-    videos: Mapping[WorkItem, ResultRow],
-    command: str,
-) -> None:
-    preset = plan.preset
-    drawn = [
-        (path, row)
-        for item, row in videos.items()
-        for path in store.outputs(item).values()
-        if path.suffix == ".mp4"
-    ]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV and OpenCV let go of the GIL
-        clips = list(pool.map(lambda video: read_video(*video), drawn))
-    facts = {
-        "Command": command,
-        "Demonstrations": f"{preset.demonstrations} of each expert, "
-        + (f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"),
-    }
-    title, caution = f"Benchmark {plan.env}", preset.caution
-    report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
-    written = write_tables(out / TABLES, report.tables)
-    written += write_figures(out / FIGURES, report.figures)
-    _remove_earlier(out, written)
-    write_json(out / VERSIONS, item_versions())
-    items = {item.folder: dict(item.settings) for item in plan.items()}
-    files = [path.relative_to(out).as_posix() for path in written]
-    write_json(out / CONFIGS, {"command": command, "items": items, "files": files})
-    write_report(out / REPORT, report)
+        preset = plan.preset
+        drawn = [
+            (path, row)
+            for item, row in videos.items()
+            for path in store.outputs(item).values()
+            if path.suffix == ".mp4"
+        ]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV and OpenCV let go of the GIL
+            clips = list(pool.map(lambda video: read_video(*video), drawn))
+        facts = {
+            "Command": command,
+            "Demonstrations": f"{preset.demonstrations} of each expert, "
+            + (f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"),
+        }
+        title, caution = f"Benchmark {plan.env}", preset.caution
+        report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
+        written = write_tables(out / TABLES, report.tables)
+        written += write_figures(out / FIGURES, report.figures)
+        _remove_earlier(out, written)
+        write_json(out / VERSIONS, item_versions())
+        items = {item.folder: dict(item.settings) for item in plan.items()}
+        files = [path.relative_to(out).as_posix() for path in written]
+        write_json(out / CONFIGS, {"command": command, "items": items, "files": files})
+        write_report(out / REPORT, report)
 
 
 def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
@@ -152,18 +141,13 @@ def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
 
 
 def _remove_earlier(out: Path, written: Sequence[Path]) -> None:
-    """Remove tables and figures of an earlier, different benchmark, by its list of them.
-
-    Earlier releases kept none: then these are all files of the formats that are written.
-    """
-    record = read_json(out / CONFIGS) if (out / CONFIGS).exists() else {}
-    suffixes = {path.suffix for path in written}
-    for folder in (out / TABLES, out / FIGURES):
-        for path in folder.iterdir() if folder.is_dir() else ():
-            name = path.relative_to(out).as_posix()
-            is_ours = name in record["files"] if "files" in record else path.suffix in suffixes
-            if is_ours and path not in written:
-                path.unlink()
+    """Remove tables and figures of an earlier, different benchmark, by its list of them."""
+    path = out / CONFIGS
+    record = read_json(path).get("files", []) if path.exists() else []
+    for name in convert(record, list[str], f"'{path}': files"):
+        earlier = out / name
+        if earlier.parent in (out / TABLES, out / FIGURES) and earlier not in written:
+            earlier.unlink(missing_ok=True)
 
 
 def _is_benchmark(folder: Path) -> bool:

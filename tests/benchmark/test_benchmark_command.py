@@ -171,7 +171,10 @@ def test_shards_and_then_a_call_without_come_to_the_same(
     written = {item.key: store.manifest(item) for item in plan.items()}
     (out / "tables").mkdir()
     (out / "tables" / "old.md").write_text("of an earlier benchmark")
+    (out / "tables" / "notes.md").write_text("of the user")
+    (out / "configs.json").write_text(json.dumps({"files": ["tables/old.md", "../x"]}))
     assert benchmark(stub_command) == 0
+    (out / "tables" / "notes.md").unlink()
     assert written == {
         item.key: store.manifest(item) for item in plan.items()
     }  # nothing done twice
