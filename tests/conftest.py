@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -16,6 +17,15 @@ if sys.platform == "linux":
 # pytest-xdist starts a process for each core: threads of torch on top of that only wait for each
 # other, and small networks in tests get a hundred times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Commands that tests start inherit signals that are ignored, as they are behind nohup or a shell's
+# "&", and would not end when a test asks them to.
+for number, action in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, action)
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 

@@ -201,13 +201,13 @@ def main(args: Sequence[str]) -> int:
     """
     prepare_pytorch()
     config = parse_config(args)
+    if is_resumed := "--resume" in args:
+        require_run(config.folder)
     require_out_folder(config.folder, RUN, [config.demonstrations])
     from robo_manip_baselines.training.device import Processes
     from robo_manip_baselines.training.trainer import train
 
     before = list_checkpoints(config.folder)
-    if is_resumed := "--resume" in args:
-        require_run(config.folder)
     code = train(config, resume=is_resumed)
     if not Processes.from_environment().is_main:
         return code

@@ -136,7 +136,9 @@ class EpisodeResult:
             values.setdefault("observation", None)
             if "arm" in values:
                 values["condition"] = values.pop("arm")
-        task = task_entry(convert(values.get("env"), str, f"{source}: env"))
+        if "env" not in values:
+            raise RequestError(f"{source}: env: is missing")
+        task = task_entry(convert(values["env"], str, f"{source}: env"))
         row = convert(values, row_type(task.name), source)
         if row["failure"] and row["failure"] not in task.failures:
             valid = ", ".join(task.failures)

@@ -316,13 +316,13 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors=_READABLE)
 
 
-def _readable(error: UnicodeError) -> tuple[bytes, int]:
+def _readable(error: UnicodeError) -> tuple[bytes | str, int]:
     """Replace characters that an encoding lacks; bytes of a path that is no UTF-8 stay as they are.
 
     The error handler of Python's codecs of the name ``_READABLE``.
     """
-    if not isinstance(error, UnicodeEncodeError):
-        raise error
+    if not isinstance(error, UnicodeEncodeError):  # a stream that is also read, as pytest does
+        return codecs.lookup_error("surrogateescape")(error)
     replaced = b""
     for character in error.object[error.start : error.end]:
         if "\udc80" <= character <= "\udcff":  # how Python holds such a byte

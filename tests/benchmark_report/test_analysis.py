@@ -69,7 +69,7 @@ def test_rows_of_many_files(tmp_path: Path, make_rows: MakeRows) -> None:
     with pytest.raises(RequestError, match=r"training seed 0, seed 1000 is also in .*line 1"):
         read_result_rows([files[0], files[0]])
     files[0].write_text('{"seed": 1}\n')
-    with pytest.raises(RequestError, match=r"line 1 is damaged: 'env' is missing"):
+    with pytest.raises(RequestError, match=r"line 1: env: is missing"):
         read_result_rows(files)
     with pytest.raises(RequestError, match="cannot be read"):
         read_result_rows([tmp_path / "none.jsonl"])

@@ -227,7 +227,7 @@ def test_killed_and_continued_it_ends_with_the_same_files(folder: Path, tmp_path
         (["FeedingEnv", "--scripted", "--preview", "-1"], "preview -1"),
         (["FeedingEnv", "--scripted", "--image_size", "big"], "image size 'big'"),
         (["FeedingEnv", "--scripted", "--image_codec", "gif"], "unknown image codec 'gif'"),
-        (["FeedingEnv", "--scripted", "--image_quality", "0"], "image quality 0"),
+        (["FeedingEnv", "--scripted", "--image_quality", "0"], "image_quality 0"),
         (["FeedingEnv", "--scripted", "--face_motion", "no"], "unknown face motion 'no'"),
         (["FeedingEnv", "--scripted", "--motion", "hop"], "unknown motion 'hop'"),
         (["FeedingEnv", "--scripted", "--motion_library", "no.npz"], "'no.npz' does not exist"),

@@ -183,7 +183,6 @@ def test_training_learns(options) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"steps": 13}, "training.steps 1, not 13"),
         ({"seed": 3}, "seed 0, not 3"),
         ({"settings": ("width=8",)}, "settings.width 16, not 8"),
         ({"hold_out": "none"}, "folds.train"),
