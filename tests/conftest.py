@@ -18,6 +18,8 @@ if sys.platform == "linux":
 # other, and small networks in tests get a hundred times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+
 # Commands that tests start inherit signals that are ignored, as they are behind nohup or a shell's
 # "&", and would not end when a test asks them to.
 for number, action in (
@@ -26,8 +28,6 @@ for number, action in (
 ):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, action)
-
-from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 
 ROOT = Path(__file__).resolve().parent.parent
 
