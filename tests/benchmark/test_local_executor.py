@@ -33,6 +33,7 @@ pytestmark = pytest.mark.long
 TIMEOUT = 60.0  # seconds; hangs fail, slow machines do not
 
 
+@pytest.mark.slow
 def test_two_workers_in_another_order_come_to_the_same_bytes(
     stub_plan: Plan, reference: dict[str, bytes], tmp_path: Path
 ) -> None:
@@ -86,6 +87,7 @@ def wait_for(pattern: str, out: Path, driver: subprocess.Popen[bytes], holds: st
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_killed_in_a_training_and_in_an_evaluation_it_comes_to_the_same(
     stub_plan: Plan, reference: dict[str, bytes], tmp_path: Path
 ) -> None:
