@@ -71,7 +71,7 @@ def test_rows_of_many_files(tmp_path: Path, make_rows: MakeRows) -> None:
     files[0].write_text('{"seed": 1}\n')
     with pytest.raises(RequestError, match=r"line 1: env: is missing"):
         read_result_rows(files)
-    with pytest.raises(RequestError, match="cannot be read"):
+    with pytest.raises(RequestError, match="cannot read"):
         read_result_rows([tmp_path / "none.jsonl"])
 
 
