@@ -281,7 +281,8 @@ class Trainer:
         parameters = list(self.state.model.parameters())
         for line in (
             f"preset: {config.preset}, seed {config.seed}",
-            f"run folder: {config.folder}",
+            f"run folder: {config.folder}"
+            + (f", resumed at step {self._saved_step}" if self._saved_step else ""),
             f"episodes: {len(setup.split.train)} for training, {len(setup.split.validation)} held "
             "out",
             f"budget: {sampler.epochs(total):.4g} epochs x {sampler.frames_per_epoch} {examples} = "
