@@ -322,7 +322,7 @@ def _readable(error: UnicodeError) -> tuple[bytes | str, int]:
     The error handler of Python's codecs of the name ``_READABLE``.
     """
     if not isinstance(error, UnicodeEncodeError):  # a stream that is also read, as pytest does
-        return codecs.lookup_error("surrogateescape")(error)
+        return codecs.replace_errors(error)
     replaced = b""
     for character in error.object[error.start : error.end]:
         if "\udc80" <= character <= "\udcff":  # how Python holds such a byte
