@@ -244,7 +244,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         """Start an episode; every random choice comes from ``seed``.
 
         Args:
-            seed: 0 to 2⁶³ - 1; None goes on with the generator of the last one.
+            seed: 0 to 2⁵³ - 1; None goes on with the generator of the last one.
             options: there are none: None or empty.
 
         Raises:

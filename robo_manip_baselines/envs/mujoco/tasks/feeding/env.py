@@ -137,7 +137,7 @@ class FeedingEnv(FaceEnv):
     | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;
     ``"human"``: MuJoCo's viewer |
 
-    Raises ``RequestError``, a ``ValueError``, when an argument, a seed (0 to 2⁶³ - 1) or an option
+    Raises ``RequestError``, a ``ValueError``, when an argument, a seed (0 to 2⁵³ - 1) or an option
     of ``reset`` (there are none) is not valid.
 
     ## Version history
