@@ -27,7 +27,7 @@ demo: setup opengl ## five scripted feeding episodes, a preview video, and a ben
 	@echo "Preview video: $$(ls $(DEMO_DIR)/*.mp4)"
 	@echo "Report: $(DEMO_RESULTS)/report.html"
 
-test: setup opengl ## every test but the slow ones (under 10 minutes on two cores)
+test: setup opengl ## every test but the slow ones (about 12 minutes on two cores)
 	$(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)
 
 test-fast: export MUJOCO_GL := disabled # so that a test that draws after all is found out
