@@ -26,12 +26,14 @@ from torch import Tensor  # noqa: E402
 
 from robo_manip_baselines.policy.act.config import ActConfig  # noqa: E402
 from robo_manip_baselines.policy.act.model import ActModel  # noqa: E402
+from robo_manip_baselines.policy.cuda_graph import WARM_UP, Replay  # noqa: E402
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel  # noqa: E402
 from robo_manip_baselines.runs.errors import RequestError, require_choice  # noqa: E402
+from robo_manip_baselines.training.device import prepare_device  # noqa: E402
 
 PHASES = ("transfer", "forward", "backward", "optimiser")
-WARM_UP = 2
 LEARNING_RATE = 1e-5
+LONGEST_KERNELS = 15
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Options:
     batch_size: int = 8
     """Examples in a training step."""
     steps: int = 5
-    """Training steps of each, in turn, after two to warm up."""
+    """Training steps of each, in turn, after some to warm up."""
     predictions: int = 30
     """Predictions of one example by each."""
     num_cameras: int = 3
@@ -67,12 +69,15 @@ class Options:
     too. With --threads 1; CPU only."""
     public: bool = True
     """Time the public code's way, too."""
+    profile: bool = False
+    """Say which kernels our steps spend the GPU's time in, and how long it waits; CUDA only."""
 
     def __post_init__(self) -> None:
         require_choice("device", self.device, ("auto", "cpu", "cuda"))
         require_choice("precision", self.precision, ("bf16", "fp32"))
-        if self.cuda_graph and self.where.type != "cuda":
-            raise RequestError("cuda_graph: needs a CUDA device; leave it out")
+        for name in ("cuda_graph", "profile"):
+            if getattr(self, name) and self.where.type != "cuda":
+                raise RequestError(f"{name}: needs a CUDA device; leave it out")
 
         if self.processor_time and self.where.type != "cpu":
             raise RequestError("processor_time: says nothing about a GPU; leave it out")
@@ -132,20 +137,6 @@ def _wait(device: torch.device) -> None:
         torch.cuda.synchronize()
 
 
-def record(compute: Callable[[], Any]) -> tuple[torch.cuda.CUDAGraph, Any]:
-    """Record what ``compute`` gives the GPU to do; returns the graph and what it returned."""
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(WARM_UP):
-            compute()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        result = compute()
-    return graph, result
-
-
 class TimedNetwork:
     """Runs steps of one network and takes the time of each phase."""
 
@@ -163,7 +154,7 @@ class TimedNetwork:
             capturable=ours and options.cuda_graph,
         )
         self.loss = torch.compile(model.loss) if ours and options.compile else model.loss
-        self.graph = record(self.compute)[0] if ours and options.cuda_graph else None
+        self.replay = Replay(self.compute, self.device) if ours and options.cuda_graph else None
 
     def autocast(self) -> contextlib.AbstractContextManager[Any]:
         """The context of the forward pass."""
@@ -182,7 +173,7 @@ class TimedNetwork:
 
     def load(self) -> None:
         """Bring the batch from main memory; a recorded step reads it where it has always been."""
-        if self.graph is None:
+        if self.replay is None:
             self.batch = _map(self.host_batch, lambda v: v.to(self.device, non_blocking=True))
         else:
             _copy(self.host_batch, self.batch)
@@ -198,10 +189,10 @@ class TimedNetwork:
         mark()
         self.load()
         mark()
-        if self.graph is None:
+        if self.replay is None:
             self.compute(mark)
         else:
-            self.graph.replay()
+            self.replay()
             mark()
             marks += [marks[-1]] * 2
         return [after - before for before, after in pairwise(marks)]
@@ -212,7 +203,7 @@ class TimedNetwork:
         start = self.clock()
         for _ in range(steps):
             self.load()
-            self.compute() if self.graph is None else self.graph.replay()
+            self.compute() if self.replay is None else self.replay()
         _wait(self.device)
         return (self.clock() - start) / steps
 
@@ -236,20 +227,19 @@ def predictor(model: PolicyModel, options: Options, ours: bool) -> Callable[[], 
 
     if not (ours and options.cuda_graph):
         return eager
-    graph, result = record(lambda: predict(on_device.state, on_device.images, None))
+    forward = Replay(lambda: predict(on_device.state, on_device.images, None), device)
 
     @torch.inference_mode()
     def replayed() -> Tensor:
         _copy(batch, on_device)
-        graph.replay()
-        return result.cpu()
+        return forward().cpu()
 
     return replayed
 
 
 def time_predictions(predict: Callable[[], Tensor], number: int, clock: Callable[[], float]) -> str:
     """Mean, median and 95th percentile in milliseconds, as cells of a table."""
-    for _ in range(WARM_UP):
+    for _ in range(WARM_UP + 1):
         predict()
     times = []
     for _ in range(number):
@@ -266,6 +256,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     device = options.where
+    prepare_device(device, options.compile)
     name = torch.cuda.get_device_name() if device.type == "cuda" else f"{options.threads} threads"
     height, width = options.image_size
     print(
@@ -281,18 +272,18 @@ def main() -> None:
     if options.public:
         models["public way"] = PublicWay(ActConfig(paper_compat=True), dims)
     if options.steps:
-        print_steps(
-            {
-                key: TimedNetwork(
-                    model,
-                    make_batch(options, options.batch_size, as_float=key != "ours"),
-                    options,
-                    ours=key == "ours",
-                )
-                for key, model in models.items()
-            },
-            options.steps,
-        )
+        networks = {
+            key: TimedNetwork(
+                model,
+                make_batch(options, options.batch_size, as_float=key != "ours"),
+                options,
+                ours=key == "ours",
+            )
+            for key, model in models.items()
+        }
+        print_steps(networks, options.steps)
+        if options.profile:
+            print_kernels(networks["ours"], options.steps)
     if options.predictions:
         print("\n| one prediction | mean, ms | median, ms | 95 %, ms |\n|---|---|---|---|")
         for key, model in models.items():
@@ -305,7 +296,7 @@ def main() -> None:
 def print_steps(networks: dict[str, TimedNetwork], steps: int) -> None:
     """Steps of each network in turn, so that whatever else the machine does is shared."""
     for network in networks.values():
-        for _ in range(WARM_UP):
+        for _ in range(WARM_UP + 1):
             network.step()
     phases: dict[str, list[list[float]]] = {key: [] for key in networks}
     for _ in range(steps):
@@ -321,6 +312,22 @@ def print_steps(networks: dict[str, TimedNetwork], steps: int) -> None:
         print(f"| {key} | {' | '.join(f'{1e3 * cell:.1f}' for cell in cells)} |", flush=True)
     if len(sums) == 2:
         print(f"\nours is {sums['public way'] / sums['ours']:.1f} times as fast")
+
+
+def print_kernels(network: TimedNetwork, steps: int) -> None:
+    """Time of the GPU's kernels in a step, the longest first, and the time between kernels."""
+    from torch.profiler import ProfilerActivity, profile
+
+    with profile(activities=[ProfilerActivity.CUDA]) as profiler:
+        seconds = network.run(steps)
+    kernels = [e for e in profiler.key_averages() if e.self_device_time_total > 0]
+    kernels.sort(key=lambda event: -event.self_device_time_total)
+    busy = sum(event.self_device_time_total for event in kernels) / steps / 1e3
+    print(f"\n| kernel, of {1e3 * seconds:.2f} ms a step | calls | ms |\n|---|---|---|")
+    for event in kernels[:LONGEST_KERNELS]:
+        cells = f"{event.count / steps:.1f} | {event.self_device_time_total / steps / 1e3:.3f}"
+        print(f"| {event.key[:70]} | {cells} |")
+    print(f"| all kernels and copies, some of them at once | | {busy:.2f} |", flush=True)
 
 
 if __name__ == "__main__":

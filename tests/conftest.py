@@ -65,5 +65,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip, with the reason, what this machine cannot run."""
     if item.get_closest_marker("gl") and (problem := opengl_problem()):
         pytest.skip(problem)
+    if item.get_closest_marker("cuda") and not _has_cuda():
+        pytest.skip("no CUDA device")
     if item.get_closest_marker("shared") and (problem := shared_problem()[1]):
         pytest.skip(problem)
+
+
+def _has_cuda() -> bool:
+    import torch  # slow to import
+
+    return torch.cuda.is_available()

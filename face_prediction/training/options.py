@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 from annotated_types import Interval
@@ -16,8 +16,7 @@ from face_prediction.models.settings import (
     PredictorTrainSettings,
     preset_settings,
 )
-from robo_manip_baselines.runs.documents import parse_json
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.documents import parse_settings
 from robo_manip_baselines.runs.ranges import (
     Amount,
     Count,
@@ -112,17 +111,5 @@ class FaceTrainOptions:
         model, training = preset_settings(self.model, self.preset)
         given = {x.name: getattr(self, x.name) for x in fields(training)}
         given = {name: value for name, value in given.items() if value is not None}
-        return model.changed(_parsed(self.settings)), replace(training, **given)
-
-
-def _parsed(settings: tuple[str, ...]) -> dict[str, Any]:
-    values = {}
-    for text in settings:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise RequestError(f"--settings {text}: no value; valid: NAME=VALUE, like width=96")
-        try:
-            values[name] = parse_json(value, f"--settings {name}")
-        except RequestError:
-            values[name] = value
-    return values
+        changes = parse_settings(self.settings, "--settings")
+        return model.changed(changes), replace(training, **given)

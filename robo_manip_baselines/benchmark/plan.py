@@ -20,9 +20,9 @@ from robo_manip_baselines.observation.error_stats import load_error_stats
 from robo_manip_baselines.rollout.demonstrate import Collection
 from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 from robo_manip_baselines.rollout.results import EpisodeResult
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.ranges import Amount, Count, Episodes, require_ranges
-from robo_manip_baselines.training.config import TrainConfig
+from robo_manip_baselines.training.config import BUDGET_OPTIONS, TrainConfig
 
 _FUNCTIONS = "robo_manip_baselines.benchmark.worker"
 """Module of the functions that do work items."""
@@ -44,6 +44,7 @@ class BenchmarkPreset:
             policy does not have are left out.
         num_envs: evaluation episodes that run at once in a work item.
         device: of networks, ``cpu`` or ``cuda``.
+        precision: of networks that act, ``fp32`` or ``bf16``.
         threads: CPU threads of each work item, whatever the number of workers: another number would
             round differently.
         gpu_share: of a GPU for each training and evaluation.
@@ -66,6 +67,7 @@ class BenchmarkPreset:
     train_settings: Mapping[str, Any] = field(default_factory=dict)
     num_envs: Count = 8
     device: str = "cpu"
+    precision: str = "fp32"
     threads: Count = 1
     gpu_share: Amount = 0.0
     caution: str = ""
@@ -95,8 +97,11 @@ PRESETS: dict[str, BenchmarkPreset] = {
         demonstration_block=4,
         num_episodes=50,
         episode_block=10,
+        # A checkpoint, with the optimiser a gigabyte, takes as long as a hundred steps.
+        train_settings={"checkpoint_every": 4000},
+        num_envs=10,
         device="cuda",
-        threads=2,
+        precision="bf16",
         gpu_share=0.125,
         seconds={"demonstrations": 10.0, "training": 600.0, "evaluation": 8.0, "video": 40.0},
     ),
@@ -217,6 +222,8 @@ class Plan:
         default = TrainConfig.from_preset(condition.policy, preset.train_preset, env=self.env)
         known = default.to_json()
         settings = {name: v for name, v in preset.train_settings.items() if name in known}
+        if settings.keys() & BUDGET_OPTIONS:  # in place of the policy's own
+            settings = {**dict.fromkeys(BUDGET_OPTIONS), **settings}
         settings |= {
             "seed": train_seed,
             "device": preset.device,
@@ -250,6 +257,7 @@ class Plan:
             num_envs=self.preset.num_envs,
             workers=0,
             device=self.preset.device,
+            precision=self.preset.precision,
             videos=int(kind == "video"),
         )
         settings = {"config": config.to_json(), "prediction": condition.prediction}
@@ -297,10 +305,14 @@ def make_plan(
         error_stats: of drawn errors; those that ship with the package if None.
 
     Raises:
-        RequestError: a file cannot be used, or a condition needs predictions that the library
-            lacks.
+        RequestError: a file cannot be used, a condition needs predictions that the library lacks,
+            or no policy has a setting.
     """
     motion = MotionLibrary.load(library)
+    policies = {condition.policy for condition in conditions}
+    known = [TrainConfig.from_preset(policy, preset.train_preset).to_json() for policy in policies]
+    for name in preset.train_settings:
+        require_choice("training setting", name, sorted(set().union(*known)))
     for condition in conditions:
         if problem := missing_predictions(condition, motion):
             raise RequestError(problem)

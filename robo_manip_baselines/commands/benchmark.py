@@ -43,6 +43,7 @@ from robo_manip_baselines.benchmark.work_item import ITEMS, ArtifactStore, WorkI
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.runs.command import EXIT_FAILED, parse
+from robo_manip_baselines.runs.documents import parse_settings
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, require_out_folder
 from robo_manip_baselines.runs.progress import closing_table, duration
@@ -73,6 +74,10 @@ class BenchmarkOptions:
         train_seeds: Trainings of each condition, seeds from 0; as in the preset if not given.
         num_episodes: Evaluation episodes of each training, seeds from 1000; as in the preset if not
             given.
+        demonstrations: Demonstrations of each expert, seeds from 0; as in the preset if not given.
+        train_settings: Settings of trainings that differ from the preset's, as NAME=VALUE
+            (steps=200); docs/training.md lists them.
+        device: Device of the networks: cpu or cuda; as in the preset if not given.
         motion_library: File of recorded face motion; the one that ships with the package if not
             given.
         error_stats: File of error statistics; the one that ships with the package if not given.
@@ -98,6 +103,9 @@ class BenchmarkOptions:
     conditions_file: Path | None = None
     train_seeds: Annotated[int, Interval(ge=1, le=1000)] | None = None
     num_episodes: Episodes | None = None
+    demonstrations: Episodes | None = None
+    train_settings: tuple[str, ...] = ()
+    device: str | None = None
     motion_library: Path | None = None
     error_stats: Path | None = None
     reference: str | None = None
@@ -115,6 +123,8 @@ class BenchmarkOptions:
             require_choice("benchmark", self.benchmark, shipped)
         require_choice("preset", self.preset, PRESETS)
         require_choice("executor", self.executor, EXECUTORS)
+        if self.device is not None:
+            require_choice("device", self.device, ("cpu", "cuda"))
         require_ranges(self)
         if self.executor == "ray" and self.num_workers is not None:
             raise RequestError("--num_workers goes with --executor local; Ray counts its own cores")
@@ -126,9 +136,12 @@ class BenchmarkOptions:
     @property
     def size(self) -> BenchmarkPreset:
         """Preset with the given numbers in place of its own."""
-        given = {"train_seeds": self.train_seeds, "num_episodes": self.num_episodes}
-        changes = {name: value for name, value in given.items() if value is not None}
-        return replace(PRESETS[self.preset], **changes)
+        names = "train_seeds", "num_episodes", "demonstrations", "device"
+        changes = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        preset = PRESETS[self.preset]
+        settings = parse_settings(self.train_settings, "--train_settings")
+        settings = {**preset.train_settings, **settings}
+        return replace(preset, train_settings=settings, **changes)
 
     @property
     def folder(self) -> Path:

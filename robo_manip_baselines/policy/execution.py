@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec
+from robo_manip_baselines.policy.cuda_graph import Replay
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -182,6 +184,13 @@ class PolicyRunner:
             (rows, *image_shape), dtype=torch.uint8, pin_memory=pinned and bool(spec.cameras)
         )
         self._noise_tile = torch.zeros(rows, model.sample_noise_size, pin_memory=pinned)
+        self._inputs: tuple[Tensor, Tensor | None, Tensor | None] = (
+            self._state_tile.to(self._device),
+            self._image_tile.to(self._device) if self._has_images else None,
+            self._noise_tile.to(self._device) if model.sample_noise_size else None,
+        )
+        # On a CPU the inputs are the tiles themselves.
+        self._compute = Replay(self._forward, self._device) if pinned else self._forward
 
     def reset(self, env_ids: EnvIds, seeds: Sequence[int]) -> None:
         """Start episodes of these seeds, (b,), in these environments."""
@@ -229,20 +238,23 @@ class PolicyRunner:
         count = len(env_ids)
         self._state_tile[count:].zero_()
         self._state_tile.numpy()[:count] = self._states[env_ids]
-        images = noise = None
         if self._has_images:
             self._image_tile[count:].zero_()
             self._image_tile.numpy()[:count] = self._images[env_ids]
-            images = self._image_tile.to(self._device, non_blocking=True)
         if self._model.sample_noise_size:
             self._noise_tile[count:].zero_()
             for row, env in enumerate(env_ids):
                 seed = derive_seed(int(self._seeds[env]), "policy", int(self._steps[env]))
                 generator = torch.Generator().manual_seed(seed)
                 self._noise_tile[row].normal_(generator=generator)
-            noise = self._noise_tile.to(self._device, non_blocking=True)
-        state = self._state_tile.to(self._device, non_blocking=True)
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._is_autocast):
-            chunks = self._model.predict(state, images, noise)
+        tiles = self._state_tile, self._image_tile, self._noise_tile
+        for tile, there in zip(tiles, self._inputs, strict=True):
+            if there is not None and there is not tile:
+                there.copy_(tile, non_blocking=True)
+        chunks = self._compute()
         # Waits for the GPU, so that the pinned memory is free for the next tile.
         return chunks[:count].float().cpu().numpy()
+
+    def _forward(self) -> Tensor:
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._is_autocast):
+            return self._model.predict(*self._inputs)

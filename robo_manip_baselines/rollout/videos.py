@@ -14,7 +14,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
-import av
 import cv2
 import gymnasium
 import numpy as np
@@ -101,12 +100,15 @@ class VideoWriter:
 
     @contextmanager
     def _open(self, path: Path, rate: Fraction, crf: int, preset: str) -> Iterator[None]:
+        import av  # slow to import; only videos need it
+
         # The index goes to the front so that a browser starts to play before all has arrived.
         options = {"movflags": "+faststart"}
         with (
             atomic_file(path) as temporary,
             av.open(str(temporary), "w", format="mp4", options=options) as self._container,
         ):
+            self._frame_type = av.VideoFrame
             self._container.metadata.update(METADATA)
             self._stream = self._container.add_stream("libx264", rate=rate)
             self._stream.pix_fmt = "yuv420p"
@@ -131,7 +133,7 @@ class VideoWriter:
             self._stream.height, self._stream.width = even.shape[:2]
         if image.shape != self._shape:
             raise ValueError(f"frame of {image.shape} in a video of {self._shape}")
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+        frame = self._frame_type.from_ndarray(np.ascontiguousarray(even), format="rgb24")
         self._container.mux(self._stream.encode(frame))
 
 

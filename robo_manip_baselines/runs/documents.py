@@ -19,7 +19,7 @@ import re
 import stat
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import accumulate
 from pathlib import Path
@@ -195,6 +195,24 @@ class YamlDocument(NamedTuple):
 def parse_json_bytes(content: bytes, source: str, limit: int = MAX_BYTES) -> Any:
     """Parse JSON in UTF-8; see `parse_json`."""
     return parse_json(_decoded(content, source), source, limit)
+
+
+def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
+    """Parse settings of a command line, NAME=VALUE each: JSON, or else text.
+
+    Raises:
+        RequestError: one of them has no value.
+    """
+    values = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not name or not equals:
+            raise RequestError(f"{option} {shown(text)}: must be NAME=VALUE, such as steps=200")
+        try:
+            values[name] = parse_json(value, f"{option} {name}")
+        except RequestError:
+            values[name] = value
+    return values
 
 
 def parse_yaml(text: str, source: str) -> YamlDocument:

@@ -6,6 +6,8 @@ and width.
 
 from __future__ import annotations
 
+import hashlib
+import math
 import os
 import threading
 from collections import OrderedDict
@@ -23,6 +25,8 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import decode_image
 from robo_manip_baselines.runs.memory import free_memory
 from robo_manip_baselines.runs.progress import track
+from robo_manip_baselines.runs.shared_arrays import SharedArray, shared_array
+from robo_manip_baselines.runs.versions import source_digest
 
 Images = NDArray[np.uint8]
 
@@ -36,8 +40,9 @@ class ImageStore(AbstractContextManager["ImageStore"]):
     Recorded images of the size ``spec.drawn_size`` become ones of ``spec.image_size`` by
     `fit_image`, which the environment applies to what it draws.
 
-    Images that fit into ``memory_budget`` are decoded once and held. Otherwise each is read from
-    its file, which stays open, and decoded when it is needed. A pool of threads does the decoding.
+    Images that fit into ``memory_budget``, or that another process on this machine holds already,
+    are decoded once and held by all of them together. Otherwise each is read from its file, which
+    stays open, and decoded when it is needed. A pool of threads does the decoding.
     The pixels are the same either way, and each image is checked against its checksum when it is
     read.
 
@@ -45,8 +50,7 @@ class ImageStore(AbstractContextManager["ImageStore"]):
 
     Args:
         demonstrations: with at least one camera in their ``spec``.
-        memory_budget: bytes that images may take; half of what is free if None. Processes on one
-            machine each hold their own: divide what there is among them.
+        memory_budget: bytes that images may take; half of what is free if None, 0 to hold none.
         threads: that decode; one for each processor if None.
 
     Attributes:
@@ -78,9 +82,14 @@ class ImageStore(AbstractContextManager["ImageStore"]):
         self._pool = ThreadPoolExecutor(threads or processors(), thread_name_prefix="images")
         shape = (int(self._offsets[-1]), *self.shape)
         budget = free_memory() // 2 if memory_budget is None else memory_budget
-        if int(np.prod(shape)) <= budget:
+        self._shared: SharedArray | None = None
+        if budget:
             try:
-                self.held = self._decode_all(np.empty(shape, np.uint8))
+                self._shared = shared_array(_key(demonstrations), shape, self._decode_all, budget)
+                if self._shared is not None:
+                    self.held = self._shared.array
+                elif math.prod(shape) <= budget:
+                    self.held = self._decode_all(np.empty(shape, np.uint8))
             except BaseException:
                 self.close()
                 raise
@@ -121,6 +130,8 @@ class ImageStore(AbstractContextManager["ImageStore"]):
         with self._reading:
             while self._open:
                 self._open.popitem()[1].close()
+            if self._shared:
+                self._shared.close()
 
     def _reader(self, episode: int) -> EpisodeReader:
         """Return the open file of an episode; the one unused for longest is closed if need be."""
@@ -147,6 +158,14 @@ class ImageStore(AbstractContextManager["ImageStore"]):
         for _ in track(done, len(numbers), "episode", "decoding images"):
             pass
         return held
+
+
+def _key(demonstrations: Demonstrations) -> str:
+    """Name of the images: what decides their pixels."""
+    spec = demonstrations.spec
+    size = spec.image_size, spec.drawn_size
+    parts = demonstrations.content_hash, spec.cameras, size, source_digest()
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 def processors() -> int:

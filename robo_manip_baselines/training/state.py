@@ -31,12 +31,23 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def make_optimizer(model: PolicyModel, settings: TrainSettings) -> torch.optim.AdamW:
-    """Make AdamW over the policy's parameter groups, fused where the device has it."""
-    fused, rate = next(model.parameters()).device.type in ("cpu", "cuda"), settings.learning_rate
+    """Make AdamW over the policy's parameter groups, fused where the device has it.
+
+    On a CUDA device learning rates are tensors there, as a recorded step needs them.
+    """
+    device, rate = next(model.parameters()).device, settings.learning_rate
     groups: Any = model.parameter_groups(rate)
-    optimizer = torch.optim.AdamW(groups, lr=rate, weight_decay=settings.weight_decay, fused=fused)
+    optimizer = torch.optim.AdamW(
+        groups,
+        lr=rate,
+        weight_decay=settings.weight_decay,
+        fused=device.type in ("cpu", "cuda"),
+        capturable=device.type == "cuda",
+    )
     for group in optimizer.param_groups:
         group["initial_lr"] = group["lr"]
+        if device.type == "cuda":
+            group["lr"] = torch.tensor(group["lr"], device=device)
     return optimizer
 
 
@@ -58,7 +69,11 @@ def learning_rate_factor(step: int, total_steps: int, settings: TrainSettings) -
 def set_learning_rate(optimizer: torch.optim.Optimizer, factor: float) -> None:
     """Set every group to its own initial learning rate times ``factor``."""
     for group in optimizer.param_groups:
-        group["lr"] = group["initial_lr"] * factor
+        rate = group["initial_lr"] * factor
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
 
 
 class WeightAverage:

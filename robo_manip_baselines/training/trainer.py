@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +21,6 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import pip_install
 from robo_manip_baselines.runs.files import locked, require_out_folder
 from robo_manip_baselines.runs.interrupt import StopRequest
-from robo_manip_baselines.runs.memory import free_memory
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import derive_seed
@@ -43,6 +41,7 @@ from robo_manip_baselines.training.state import (
     learning_rate_factor,
     set_learning_rate,
 )
+from robo_manip_baselines.training.step import TrainingStep
 
 KEPT_CHECKPOINTS = 2
 
@@ -96,9 +95,7 @@ def _train(
             log = stack.enter_context(setup.open_log(start)) if processes.is_main else None
             images = None
             if setup.dims.cameras:
-                # Half of the free memory, which the processes of one machine share.
-                budget = free_memory() // 2 // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-                images = stack.enter_context(ImageStore(setup.demonstrations, memory_budget=budget))
+                images = stack.enter_context(ImageStore(setup.demonstrations))
             trainer = Trainer(setup, start, device, processes, images=images, log=log)
             stop = stack.enter_context(StopRequest(once_more=processes.world_size == 1))
             if trainer.run(stop) < setup.total_steps:
@@ -157,7 +154,14 @@ class Trainer:
         loss: nn.Module = _LossModule(model)
         if processes.world_size > 1:
             loss = DistributedDataParallel(loss, gradient_as_bucket_view=True)
-        self._compute_loss = torch.compile(loss) if settings.compile else loss
+        self._step = TrainingStep(
+            torch.compile(loss) if settings.compile else loss,
+            self.state,
+            autocast=self._autocast,
+            clip_norm=settings.clip_norm,
+            timer=self._timer,
+            is_recorded=settings.cuda_graph and device.type == "cuda" and processes.world_size == 1,
+        )
         names = task_entry(config.env).names
         noise = StateNoise(given.spec, names, settings.state_noise, settings.clock_noise)
         episodes = given.indices(setup.split.train)
@@ -183,7 +187,6 @@ class Trainer:
         """
         config, total_steps = self._setup.config, self._setup.total_steps
         settings, model, optimizer = config.training, self.state.model, self.state.optimizer
-        autocast = torch.autocast(self._device.type, self._autocast, enabled=bool(self._autocast))
         timer, progress = self._timer, self._progress
         batches = self.loader.batches(progress.step, total_steps)
         with progress, contextlib.closing(batches):
@@ -195,16 +198,7 @@ class Trainer:
                     model.train()
                 torch.manual_seed(derive_seed(config.seed, "dropout", self._processes.rank, step))
                 set_learning_rate(optimizer, learning_rate_factor(step, total_steps, settings))
-                with autocast:
-                    losses = self._compute_loss(batch)
-                timer.mark("forward")
-                losses["loss"].backward()
-                timer.mark("backward")
-                if settings.clip_norm:
-                    norm = nn.utils.clip_grad_norm_(self.state.trained, settings.clip_norm)
-                    losses = {**losses, "grad_norm": norm}
-                optimizer.step()
-                optimizer.zero_grad(set_to_none=True)
+                losses = self._step(batch)
                 if self.state.average:
                     self.state.average.update(step)
                 timer.mark("optimizer")
@@ -238,7 +232,7 @@ class Trainer:
         self._require_finite(math.isfinite(losses["loss"]))
         values = {
             **losses,
-            "learning_rate": self.state.optimizer.param_groups[0]["lr"],
+            "learning_rate": float(self.state.optimizer.param_groups[0]["lr"]),
             "seconds": self._progress.seconds,
             **{f"seconds_{phase}": seconds for phase, seconds in self._timer.read().items()},
         }

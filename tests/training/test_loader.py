@@ -29,7 +29,6 @@ TRAIN = (3, 0, 4)  # not in order: the schedule's episodes are places in this li
 CHUNK = 4
 NOISE = 3
 
-cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
 
 @pytest.fixture(scope="module")
@@ -307,7 +306,7 @@ def copies(loader: BatchLoader, steps: int) -> list[Batch]:
     return kept
 
 
-@cuda
+@pytest.mark.cuda
 @pytest.mark.parametrize("budget", [0, None])
 def test_a_gpu_gets_the_same_images(shown: Demonstrations, budget: int | None) -> None:
     with ImageStore(shown, memory_budget=budget) as images:
@@ -319,7 +318,7 @@ def test_a_gpu_gets_the_same_images(shown: Demonstrations, budget: int | None) -
             assert_equal(batch, here.batch(step))
 
 
-@cuda
+@pytest.mark.cuda
 @pytest.mark.parametrize("depth", [0, 4])
 @pytest.mark.parametrize("noise_size", [0, NOISE])
 def test_a_gpu_gets_the_same_vectors(blind: Demonstrations, depth: int, noise_size: int) -> None:

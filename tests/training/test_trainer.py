@@ -334,3 +334,23 @@ def test_gradients_have_the_layout_of_their_weights(episodes: Path, tmp_path: Pa
     for parameter, moments in state.optimizer.state.items():
         assert moments["exp_avg"].stride() == parameter.stride()
     assert seen, "no convolution has its weights in channels_last"
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", ["average, cosine, warm-up, clipped", "images"])
+def test_a_recorded_step_trains_as_a_computed_one(
+    name: str, episodes: Path, tmp_path: Path
+) -> None:
+    """With the same masks of dropout; across an interruption, too."""
+    on_gpu = f"{RUNS[name]} --device cuda --precision fp32 --log_every 1"
+    run(f"{on_gpu} --no_cuda_graph", episodes, tmp_path / "computed")
+    run(on_gpu, episodes, tmp_path / "recorded")
+    run(on_gpu, episodes, tmp_path / "parts", stop_at=6)
+    run(on_gpu, episodes, tmp_path / "parts")
+    losses = []
+    for out in ("computed", "recorded", "parts"):
+        lines = [x for x in read_metrics(tmp_path / out / METRICS) if x["kind"] == "train"]
+        assert [line["step"] for line in lines] == list(range(1, STEPS + 1))
+        losses.append([line["loss"] for line in lines])
+    np.testing.assert_allclose(losses[1], losses[0], rtol=5e-3)  # TF32
+    np.testing.assert_allclose(losses[2], losses[0], rtol=5e-3)
