@@ -29,7 +29,7 @@ from robo_manip_baselines.policy.act.model import ActModel  # noqa: E402
 from robo_manip_baselines.policy.cuda_graph import WARM_UP, Replay  # noqa: E402
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel  # noqa: E402
 from robo_manip_baselines.runs.errors import RequestError, require_choice  # noqa: E402
-from robo_manip_baselines.training.device import prepare_device  # noqa: E402
+from robo_manip_baselines.training.device import choose_device, prepare_device  # noqa: E402
 
 PHASES = ("transfer", "forward", "backward", "optimiser")
 LEARNING_RATE = 1e-5
@@ -90,8 +90,7 @@ class Options:
     @property
     def where(self) -> torch.device:
         """The device that ``device`` names."""
-        found = "cuda" if torch.cuda.is_available() else "cpu"
-        return torch.device(found if self.device == "auto" else self.device)
+        return choose_device(self.device)
 
 
 def make_batch(options: Options, size: int, as_float: bool) -> Batch:
