@@ -314,7 +314,9 @@ def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:
             f"{spec.horizon}; choose a horizon up to {known}, or record again: "
             f"{recording_command(episode.task.name, again, spec)}"
         )
-    if spec.corruption.error == "model" and (problem := prediction_problem(predicted, spec.horizon)):
+    if spec.corruption.error == "model" and (
+        problem := prediction_problem(predicted, spec.horizon)
+    ):
         raise RequestError(f"'{path}' holds {problem}")
     recorded = attributes["cameras"]
     there = ", ".join(recorded) or "none"

@@ -21,8 +21,8 @@ FRAME_PERIOD = 1.0 / FRAME_RATE
 """s between two frames of the recorded motion and of the prediction (paper, section IV.A)."""
 
 MAX_HORIZON = 24
-"""Frames of the longest horizon, 0.8 s: enough for a delay, the arm's lag and the age of a plan. The
-paper's predictor looks 5 frames ahead (section IV.A)."""
+"""Frames of the longest horizon, 0.8 s: room for a delay, the arm's lag and the age of a plan. The
+predictor of the paper looks 5 frames ahead (section IV.A)."""
 
 
 @dataclass(frozen=True)

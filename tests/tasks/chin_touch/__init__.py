@@ -27,7 +27,7 @@ ENTRY = TaskEntry(
         Field(
             "chin_position",
             ("T", "K", 3),
-            "True chin now (k = 0) and k = 1…K - 1 frames of `prediction_period` ahead: x, y, z",
+            "True chin now (k = 0) and k = 1…K-1 frames of `prediction_period` ahead: x, y, z",
             "m",
             "world",
         ),

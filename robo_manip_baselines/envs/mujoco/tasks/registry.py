@@ -413,7 +413,7 @@ FACE_FIELDS = (
     Field(
         "mouth_position",
         ("T", "K", 3),
-        "True mouth centre now (k = 0) and k = 1…K - 1 frames of `prediction_period` ahead: x, y, z",
+        "True mouth centre now (k = 0) and k = 1…K-1 frames of `prediction_period` ahead: x, y, z",
         "m",
         "world",
     ),
