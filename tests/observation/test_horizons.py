@@ -215,7 +215,8 @@ def test_a_library_shows_as_far_as_it_predicts(tmp_path: Path, frames: int) -> N
             predicted = world_of(env).predicted_mouth
             assert predicted is not None
             assert predicted.shape == (frames, 3)
-            steps = [env.step(np.asarray(env.action_space.low))[0] for _ in range(20)]
+            action = np.asarray(world_of(env).data.ctrl[-7:], np.float32)
+            steps = [env.step(action)[0] for _ in range(20)]
             shown.append([step["prediction"] for step in steps])
     # The predictions are the truth, in float32, relative to a mouth in float32.
     np.testing.assert_allclose(shown[0], shown[1], atol=1e-6)
