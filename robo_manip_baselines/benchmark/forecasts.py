@@ -3,7 +3,7 @@
 They are written into a library of recorded motion in place of a predictor's output, so that
 environments and episode files carry them like any other prediction.
 
-Legend: N frames of the library, H = 5 frames ahead.
+Legend: N frames of the library, H = 24 frames ahead.
 """
 
 from __future__ import annotations

@@ -305,8 +305,8 @@ def make_plan(
         error_stats: of drawn errors; those that ship with the package if None.
 
     Raises:
-        RequestError: a file cannot be used, a condition needs predictions that the library lacks,
-            or no policy has a setting.
+        RequestError: a file cannot be used, a condition needs predictions that the library lacks or
+            errors further ahead than the statistics go, or no policy has a setting.
     """
     motion = MotionLibrary.load(library)
     policies = {condition.policy for condition in conditions}
@@ -316,7 +316,13 @@ def make_plan(
     for condition in conditions:
         if problem := missing_predictions(condition, motion):
             raise RequestError(problem)
-    load_error_stats(error_stats)
+    stats = load_error_stats(error_stats)
+    for condition in conditions:
+        if condition.spec.corruption.error in MEASURED_ERRORS:
+            try:
+                stats.require_horizon(condition.spec.horizon)
+            except RequestError as error:
+                raise RequestError(f"condition '{condition.name}': {error}") from None
     return Plan(
         env,
         preset,
@@ -328,11 +334,17 @@ def make_plan(
 
 def missing_predictions(condition: ConditionConfig, library: MotionLibrary) -> str:
     """Return why a condition lacks a predictor's output in the library; empty if it does not."""
-    if condition.spec.corruption.error != "model" or library.predicted is not None:
+    spec, frames = condition.spec, library.predicted_frames
+    if spec.corruption.error != "model" or spec.horizon <= frames:
         return ""
+    lacking = (
+        f"predicts the mouth {frames} frames ahead, not {spec.horizon}"
+        if frames
+        else "has no predicted mouth"
+    )
     return (
         f"condition '{condition.name}' observes a trained predictor's output, and "
-        f"'{library.source}' has no predicted mouth; give a library with --motion_library that "
+        f"'{library.source}' {lacking}; give a library with --motion_library that "
         "'python -m face_prediction predict' wrote, or leave the condition out"
     )
 

@@ -78,6 +78,7 @@ def dataset_info(folder: Path) -> dict[str, str]:
         "demonstrations": str(len(paths)),
         "kept apart": f"{len(failed)} in {FAILED_FOLDER}/",
         "environment": _counted(item["env_id"] for item in metadata),
+        "schema version": _counted(item["schema_version"] for item in metadata),
         "expert": _counted(item["expert"] for item in metadata),
         "success": f"{successes} of {len(metadata)} tried, {strict} by the strict condition",
         "duration": f"{mixture or _spread(durations)}; {sum(durations):.1f} s in all",

@@ -23,7 +23,7 @@ from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_
 from robo_manip_baselines.data.schema import POLICY_ATTRIBUTES
 from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import ObservationSpec, State
-from robo_manip_baselines.observation.corruption import NO_PREDICTION
+from robo_manip_baselines.observation.corruption import prediction_problem
 from robo_manip_baselines.observation.spec import size_text
 from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError
@@ -283,6 +283,14 @@ def _require_same(
             )
 
 
+def _frames_ahead(episode: EpisodeReader) -> tuple[int, int]:
+    """Return how many frames ahead the target is known, and predicted (0 without predictions)."""
+    task = episode.task
+    has_prediction = task.predicted_field in episode.fields
+    predicted = episode.array(task.predicted_field).shape[1] if has_prediction else 0
+    return episode.array(task.target_field).shape[1] - 1, predicted
+
+
 def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:
     """Raise RequestError if an episode is no demonstration of what is to be observed."""
     path, attributes = episode.path, episode.attributes
@@ -298,8 +306,18 @@ def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:
         )
     if spec.object_pose and not episode.task.names.objects:
         raise RequestError(f"object_pose: {episode.task.name} has no objects; leave it out")
-    if spec.corruption.error == "model" and episode.task.predicted_field not in episode.fields:
-        raise RequestError(f"'{path}' holds {NO_PREDICTION}")
+    known, predicted = _frames_ahead(episode)
+    if spec.frames - 1 > known:
+        again = path.parent.with_name(f"{path.parent.name}_longer")
+        raise RequestError(
+            f"'{path}' holds the {episode.task.names.target} {known} frames ahead, not "
+            f"{spec.horizon}; choose a horizon up to {known}, or record again: "
+            f"{recording_command(episode.task.name, again, spec)}"
+        )
+    if spec.corruption.error == "model" and (
+        problem := prediction_problem(predicted, spec.horizon)
+    ):
+        raise RequestError(f"'{path}' holds {problem}")
     recorded = attributes["cameras"]
     there = ", ".join(recorded) or "none"
     # Beside, for episodes with other images do not belong into the same folder.

@@ -404,7 +404,9 @@ def _checked_attributes(
     values: dict[str, Any] = {
         **attributes,
         "schema": SCHEMA,
-        "schema_version": schema.version_of(fields),
+        "schema_version": schema.version_of(
+            {name: values.shape for name, values in fields.items()}
+        ),
         "content_sha256": "",
         "num_steps": num_steps,
         "cameras": sorted(images),

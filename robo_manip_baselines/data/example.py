@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from robo_manip_baselines.data.schema import EpisodeSchema
+from robo_manip_baselines.data.schema import OLD_FRAMES, EpisodeSchema
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import MAX_HORIZON
 from robo_manip_baselines.runs.images import encode_image
 
 
@@ -20,11 +21,12 @@ def make_arrays(
         steps: T.
         seed: of the numbers.
         arms: 1 or 2.
-        version: of the schema.
+        version: of the schema, which decides how far ahead the truth is known.
     """
     schema = EpisodeSchema.of(task_entry("FeedingEnv"))
     rng = np.random.default_rng(seed)
-    sizes = {"T": steps, "A": 7 * arms, "J": 6 * arms, "G": arms, "Q": 23, "V": 22}
+    sizes = {"T": steps, "A": 7 * arms, "J": 6 * arms, "G": arms, "Q": 23, "V": 22, "H": 5}
+    sizes["K"] = MAX_HORIZON + 1 if version > 2 else OLD_FRAMES
     arrays: dict[str, np.ndarray] = {}
     # By version, so that the numbers of the older fields are those of an older file.
     for field in sorted(schema.fields, key=lambda field: field.since):

@@ -1,8 +1,8 @@
 """Schema of episode files: the one table that writer, reader, verifier and docs are made from.
 
 Shape symbols: T control steps, A actions, J arm joints, G grippers, Q positions and V velocities
-of the simulator's state. One arm has A=7, J=6, G=1; two arms have A=14, J=12, G=2, left before
-right.
+of the simulator's state, K frames of the truth from now on, H frames of a forecast. One arm has
+A=7, J=6, G=1; two arms have A=14, J=12, G=2, left before right.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     TaskEntry,
     env_kwargs_problem,
 )
-from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.observation import CAMERAS, MAX_HORIZON
 from robo_manip_baselines.runs.documents import parse_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import CODECS, MAX_SIDE
@@ -35,8 +35,12 @@ from robo_manip_baselines.runs.npz import add_array
 SCHEMA = "robo_manip_baselines/episode"
 SCHEMA_VERSION = 3
 READABLE_VERSIONS = (1, 2, 3)
-"""A file has the lowest version that describes it: 2 added ``predicted_mouth``, 3 other tasks than
-feeding, whose fields and attributes are those of the task that ``env_id`` names."""
+"""A file has the lowest version that describes it: 2 added ``predicted_mouth``, 3 the truth more
+than 5 frames ahead, and other tasks than feeding, whose fields and attributes are those of the task
+that ``env_id`` names."""
+
+OLD_FRAMES = 6
+"""K of files of versions 1 and 2: the truth now and 1 ... 5 frames ahead."""
 
 # A group for each camera: `data`, the images one after another; `offset` (T + 1,), where each
 # begins; `checksum` (T,), the CRC-32 of each. HDF5's own type for rows of varying length is not
@@ -60,10 +64,17 @@ SYMBOLS: Mapping[str, str] = {
     "G": "grippers: 1 or 2",
     "Q": "simulator positions (`model.nq`)",
     "V": "simulator velocities (`model.nv`)",
+    "K": "frames of the truth, from now on: 25; in files of versions 1 and 2, 6",
+    "H": "frames of the forecast: 1 to 24, as many as the motion library holds; the shipped one, 5",
 }
-ALLOWED_SIZES: Mapping[str, tuple[int, ...]] = {"A": (7, 14), "J": (6, 12), "G": (1, 2)}
+ALLOWED_SIZES: Mapping[str, tuple[int, ...]] = {
+    "A": (7, 14),
+    "J": (6, 12),
+    "G": (1, 2),
+    "K": (OLD_FRAMES, MAX_HORIZON + 1),
+}
 
-MAX_SIZES: Mapping[str, int] = {"T": 180_000, "Q": 1000, "V": 1000}
+MAX_SIZES: Mapping[str, int] = {"T": 180_000, "Q": 1000, "V": 1000, "H": MAX_HORIZON}
 """Largest sizes: an hour at 50 steps a second. Checked before memory is taken."""
 
 MAX_BYTES = 2**30
@@ -196,9 +207,15 @@ class EpisodeSchema:
         """Name -> attribute."""
         return {item.name: item for item in self.attributes}
 
-    def version_of(self, names: Iterable[str]) -> int:
-        """Return the schema version of a file with these fields."""
-        return max([self.version, *(self.by_name[name].since for name in names)])
+    def version_of(self, shapes: Mapping[str, tuple[int, ...]]) -> int:
+        """Return the schema version of a file whose fields have these names and shapes."""
+        fields = [(self.by_name[name], shape) for name, shape in shapes.items()]
+        is_long = any(
+            symbol == "K" and size > OLD_FRAMES
+            for field, shape in fields
+            for symbol, size in zip(field.shape, shape, strict=True)
+        )
+        return max([self.version, 3 if is_long else 1, *(field.since for field, _ in fields)])
 
     def fields_of(self, version: int, present: Iterable[str] = ()) -> tuple[str, ...]:
         """Return the names of the fields that a file of a schema version holds, or should.

@@ -48,6 +48,9 @@ from robo_manip_baselines.runs.progress import track
 SHARED_ATTRIBUTES = (*POLICY_ATTRIBUTES, "env_kwargs", "cameras", "image_size")
 """Attributes that the episodes of a folder must share."""
 
+_MAY_DIFFER = "schema_version"
+"""Attribute that is a warning where it differs: files of all versions serve short horizons."""
+
 
 def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
     """Everything that is wrong with the episodes of a folder and its ``failed/``.
@@ -86,7 +89,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 def _mixed(metadata: dict[Path, dict[str, Any]]) -> list[Problem]:
     """Files that differ from most others in what all of them should share."""
     problems: list[Problem] = []
-    for name in SHARED_ATTRIBUTES:
+    for name in (*SHARED_ATTRIBUTES, _MAY_DIFFER):
         values = {
             path: json.dumps(_comparable(name, attributes[name]), sort_keys=True)
             for path, attributes in metadata.items()
@@ -96,7 +99,11 @@ def _mixed(metadata: dict[Path, dict[str, Any]]) -> list[Problem]:
         if len(counts) > 1:
             usual, number = counts[0]
             problems += [
-                Problem(path, f"{name} is {value}, but {usual} in {number} other files")
+                Problem(
+                    path,
+                    f"{name} is {value}, but {usual} in {number} other files",
+                    is_warning=name == _MAY_DIFFER,
+                )
                 for path, value in values.items()
                 if value != usual
             ]

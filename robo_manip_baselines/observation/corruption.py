@@ -1,6 +1,6 @@
 """Corruption of the observed target: ``truth -> predict -> error -> delay -> dropout``.
 
-Legend: T control steps, K = 6 frames from now to the longest horizon, H horizons of the error, F
+Legend: T control steps, K frames from now to the longest known horizon, H horizons of the error, F
 video frames, J detections at the detector's own rate, ... any shape of times.
 """
 
@@ -39,12 +39,6 @@ MAX_DELAY = 900
 
 DROPOUT_LENGTH = 15.0
 """Default mean length of a loss of the face, frames: half a second."""
-
-NO_PREDICTION = (
-    "no predicted mouth, which the error 'model' shows; use a motion library that "
-    "'python -m face_prediction predict' wrote, or choose another error"
-)
-"""End of the message where a library or an episode holds no predictions."""
 
 _FIRST_FRAMES = 512
 """Frames drawn when an episode starts, 17 s; a longer episode draws more."""
@@ -244,15 +238,11 @@ class CorruptionPipeline:
     """
 
     def __init__(self, corruption: Corruption, horizon: int = 0) -> None:
-        self.corruption = corruption
+        self.corruption, self.horizon = corruption, horizon
         self._draw_error: Draw | None = None
         if corruption.error in MEASURED_ERRORS:
             stats = load_error_stats(corruption.error_stats, corruption.stats_sha256)
-            if horizon > stats.horizons:
-                raise RequestError(
-                    f"error statistics '{stats.source}' go {stats.horizons} frames ahead; choose "
-                    f"a horizon up to that, not {horizon}, or other statistics"
-                )
+            stats.require_horizon(horizon)
             self._draw_error = DRAWN_ERRORS[corruption.error](stats)
         self.reset(0)
 
@@ -312,11 +302,14 @@ class CorruptionPipeline:
             ahead = min(error.shape[1], observed.shape[1] - 1)
             observed[:, 1 : ahead + 1] += error[error_frame, :ahead]
         elif self.corruption.error == "model":
-            if predicted is None:
-                raise RequestError(f"there is {NO_PREDICTION}")
+            frames = 0 if predicted is None else predicted.shape[1]
+            if problem := prediction_problem(frames, self.horizon):
+                raise RequestError(f"the state holds {problem}")
+            assert predicted is not None
             # The error that the predictor made in a video frame lasts until the next.
             made = np.searchsorted(time, error_frame / FRAME_RATE - _TIME_ROUNDING)
-            observed[:, 1:] += predicted[made] - position[made, 1:]
+            ahead = slice(1, min(frames + 1, position.shape[1]))
+            observed[:, ahead] += predicted[made, : ahead.stop - 1] - position[made, ahead]
         return TargetObservation(seen, observed)
 
     def _append(self, state: State) -> None:
@@ -338,6 +331,29 @@ class CorruptionPipeline:
             error = self._draw_error(rng, frames) @ WORLD_FROM_IMAGE
         lost = draw_lost(corruption, _stream(corruption.seed, seed, "lost"), frames)
         return error, DetectionTiming.of(corruption, lost)
+
+
+def prediction_problem(frames: int, horizon: int) -> str:
+    """Return why a predictor's output cannot be observed with the error ``model``, or "".
+
+    Args:
+        frames: that the output looks ahead; 0 for none at all.
+        horizon: frames that are to be observed.
+
+    Returns:
+        End of a message that says what a library or an episode "holds".
+    """
+    if not frames:
+        return (
+            "no predicted mouth, which the error 'model' shows; use a motion library that "
+            "'python -m face_prediction predict' wrote, or choose another error"
+        )
+    if horizon > frames:
+        return (
+            f"the predicted mouth {frames} frames ahead, not {horizon}; choose a horizon up to "
+            f"{frames}, a motion library with longer predictions, or another error"
+        )
+    return ""
 
 
 def frame_of(time: ArrayLike, rate: float = FRAME_RATE) -> NDArray[np.int64]:

@@ -63,6 +63,18 @@ class ErrorStats:
         """H, how many frames ahead there are errors of."""
         return len(self.mean_abs)
 
+    def require_horizon(self, horizon: int) -> None:
+        """Require statistics that far ahead: they are measured, and errors beyond them unknown.
+
+        Raises:
+            RequestError: they do not go that far.
+        """
+        if horizon > self.horizons:
+            raise RequestError(
+                f"error statistics '{self.source}' go {self.horizons} frames ahead; choose a "
+                f"horizon up to that, not {horizon}, or other statistics"
+            )
+
 
 def load_error_stats(path: str | Path | None = None, sha256: str | None = None) -> ErrorStats:
     """Read what ``face_prediction export-stats`` wrote.

@@ -95,7 +95,7 @@ class ObservationSpec:
     Attributes:
         obs: Preset: baseline (robot and cameras), current (also the mouth and its distance to the
             gripper) or current_pred (the mouth now and in the next frames).
-        horizon: Frames of 1/30 s that current_pred looks ahead, 1 to 5.
+        horizon: Frames of 1/30 s that current_pred looks ahead, 1 to 24.
         cameras: Cameras, any of top, angle and front_close, or none.
         image_size: Height and width of the images in pixels.
         render_size: Height and width at which cameras are drawn before `fit_image` makes images of

@@ -1,7 +1,8 @@
 """State of the simulator before corruption, and the observed target.
 
 Legend: ... any leading shape (none in an environment, (T,) for an episode, (B, T) for a batch),
-A arms, O objects of the task, K = 6 frames from now to the longest horizon.
+A arms, O objects of the task, K frames from now to the longest known horizon, H frames of a
+forecast. Environments and new episode files have K = `MAX_HORIZON` + 1, older files K = 6.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ FRAME_RATE = 30.0
 FRAME_PERIOD = 1.0 / FRAME_RATE
 """s between two frames of the recorded motion and of the prediction (paper, section IV.A)."""
 
-MAX_HORIZON = 5
-"""Frames that the predictor of the paper looks ahead (section IV.A)."""
+MAX_HORIZON = 24
+"""Frames of the longest horizon, 0.8 s: room for a delay, the arm's lag and the age of a plan. The
+predictor of the paper looks 5 frames ahead (section IV.A)."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,9 @@ class State:
         gripper_position: (..., A) m, position of a finger.
         gripper_velocity: (..., A) m/s.
         end_effector_position: (..., 3) m, gripper site of the right arm.
-        target_position: (..., K, 3) m, now and 1 ... 5 frames ahead.
+        target_position: (..., K, 3) m, now and 1 ... K - 1 frames ahead.
         object_position: (..., O, 3) m, centres of the task's objects.
-        predicted_target: (..., K - 1, 3) m, output of a trained predictor for 1 ... 5 frames ahead;
+        predicted_target: (..., H, 3) m, output of a trained predictor for 1 ... H frames ahead;
             None where the recorded motion holds none.
     """
 
@@ -59,7 +61,7 @@ class TargetObservation:
 
     Attributes:
         time: (...) s since the start of the episode at which it was seen.
-        position: (..., K, 3) m, at that time and 1 ... 5 frames after it.
+        position: (..., K, 3) m, at that time and 1 ... K - 1 frames after it.
     """
 
     time: Floats

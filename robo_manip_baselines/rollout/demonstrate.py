@@ -27,6 +27,7 @@ from robo_manip_baselines.data import (
     write_episode,
 )
 from robo_manip_baselines.data.files import FAILED_FOLDER, list_failures, seed_of
+from robo_manip_baselines.data.schema import SCHEMA_VERSION
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
@@ -409,6 +410,7 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
         "image_codec": collection.codec,
         "image_quality": collection.quality,
         "xml_hash": xml_hash,
+        "schema_version": SCHEMA_VERSION,
         "versions": _deciding_versions(software_versions(*RECORDING_SOFTWARE)),
     }
     for seed in sorted(finished_seeds(collection.out)):

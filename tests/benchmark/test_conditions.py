@@ -117,7 +117,7 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
         ("- {name: a, horizn: 3}", ["line 3", "horizn", "did you mean 'horizon'"]),
         ("- {name: a, horizon: three}", ["line 3", "horizon: must be a whole number", "'three'"]),
         ("- {name: a, horizon: true}", ["line 3", "a whole number"]),
-        ("- {name: a, horizon: 6}", ["line 3", "horizon 6", "5 or less"]),
+        ("- {name: a, horizon: 25}", ["line 3", "horizon 25", "24 or less"]),
         ("- {name: a, error: unifrom}", ["line 3", "unifrom", "did you mean 'uniform'"]),
         ("- {name: a, obs: curent}", ["line 3", "did you mean 'current'"]),
         ("- {name: a, obs: current, error: uniform}", ["line 3", "forecasts"]),

@@ -19,11 +19,11 @@ def library() -> MotionLibrary:
 
 
 def true_moves(library: MotionLibrary) -> np.ndarray:
-    """(N, 5, 3) by loops; within a run, held at its end."""
-    moves = np.zeros((len(library.mouth), 5, 3))
+    """(N, 24, 3) by loops; within a run, held at its end."""
+    moves = np.zeros((len(library.mouth), 24, 3))
     for start, length in zip(library.run_start, library.run_length, strict=True):
         for frame in range(start, start + length):
-            for k in range(1, 6):
+            for k in range(1, 25):
                 later = min(frame + k, start + length - 1)
                 moves[frame, k - 1] = library.mouth[later] - library.mouth[frame]
     return moves
@@ -31,8 +31,8 @@ def true_moves(library: MotionLibrary) -> np.ndarray:
 
 def test_persistence_says_that_nothing_moves(library: MotionLibrary) -> None:
     forecast = FORECASTS["persistence"](library)
-    assert forecast.shape == (len(library.mouth), 5, 3)
-    for k in range(5):
+    assert forecast.shape == (len(library.mouth), 24, 3)
+    for k in range(24):
         np.testing.assert_array_equal(forecast[:, k], library.mouth)
 
 
@@ -40,7 +40,7 @@ def test_shuffled_moves_as_fast_and_says_nothing(library: MotionLibrary) -> None
     told = FORECASTS["shuffled"](library) - library.mouth[:, None]
     true = true_moves(library)
     # The same moves, each of them at another time.
-    for k in range(5):
+    for k in range(24):
         np.testing.assert_allclose(np.sort(told[:, k, 0]), np.sort(true[:, k, 0]), atol=1e-9)
     for axis in range(3):
         correlation = np.corrcoef(told[:, 4, axis], true[:, 4, axis])[0, 1]

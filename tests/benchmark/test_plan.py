@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -183,6 +184,30 @@ def test_the_shipped_benchmarks_can_be_planned(tmp_path: Path) -> None:
         if item.kind == "demonstrations"
     ]
     assert set(names) == {"motion_library.npz", "motion_forecast.npz"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"horizon": 24}, ""),
+        ({"horizon": 24, "prediction": "persistence"}, ""),
+        ({"horizon": 5, "error": "uniform"}, ""),
+        ({"horizon": 6, "error": "uniform"}, r"'far': error statistics .* go 5 frames ahead"),
+        ({"horizon": 6, "error": "empirical"}, r"'far': error statistics .* go 5 frames ahead"),
+        ({"horizon": 5, "error": "model"}, ""),
+        ({"horizon": 6, "error": "model"}, r"'far' .* predicts the mouth 5 frames ahead, not 6"),
+    ],
+)
+def test_horizons_beyond_what_was_measured_are_refused(
+    changes: dict[str, Any], message: str
+) -> None:
+    condition = changed(name="far", **changes)
+    if not message:
+        assert plan(condition).runs
+        return
+    with pytest.raises(RequestError, match=message) as caught:
+        plan(condition)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_video_acts_one_episode_of_a_training_out() -> None:

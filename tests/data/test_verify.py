@@ -105,7 +105,8 @@ DAMAGE: list[tuple[Callable[[h5py.File], Any], str]] = [
     (lambda file: file.attrs.__delitem__("seed"), "attribute 'seed' is missing"),
     (_replace("action", lambda x: x[:, :6]), "'action' has A=6, not 7 or 14"),
     (_replace("action", lambda x: x[:-1]), "'action' has T=11 where 'time' has T=12"),
-    (_replace("mouth_position", lambda x: x[:, :5]), "(12, 5, 3), not (T, 6, 3)"),
+    (_replace("mouth_position", lambda x: x[:, :5]), "'mouth_position' has K=5, not 6 or 25"),
+    (_replace("mouth_position", lambda x: x[:, 0]), "(12, 3), not (T, K, 3)"),
     (_replace("qpos", lambda x: x[:, 0]), "'qpos' has shape (12,), not (T, Q)"),
     (_replace("qpos", lambda x: x.astype(np.float32)), "'qpos' is float32, not float64"),
     (

@@ -32,7 +32,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "baseline": {"obs": "baseline"},
     "current": {"obs": "current"},
     "current_pred": {"obs": "current_pred", "horizon": 5},
-    "both arms": {"obs": "current_pred", "horizon": 1, "arms": "both", "motion": "recorded+tremor"},
+    "both arms": {
+        "obs": "current_pred",
+        "horizon": 24,
+        "arms": "both",
+        "motion": "recorded+tremor",
+    },
     "after lift": {"obs": "current", "face_motion": "after_lift"},
 }
 
@@ -322,10 +327,10 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
         ({"cameras": ("top", "top")}, "each may be named once"),
         ({"cameras": None}, "cameras None: must be names of cameras.*valid: top, angle"),
         ({"cameras": [1]}, r"cameras \[1\]: must be names of cameras"),
-        ({"horizon": 0}, "horizon 0: must be 1 to 5"),
-        ({"horizon": 6}, "horizon 6: must be 1 to 5"),
-        ({"horizon": "2"}, "horizon '2': must be 1 to 5"),
-        ({"horizon": 2.5}, "horizon 2.5: must be 1 to 5"),
+        ({"horizon": 0}, "horizon 0: must be 1 to 24"),
+        ({"horizon": 25}, "horizon 25: must be 1 to 24"),
+        ({"horizon": "2"}, "horizon '2': must be 1 to 24"),
+        ({"horizon": 2.5}, "horizon 2.5: must be 1 to 24"),
         ({"image_size": (0, 640)}, "image size"),
         ({"image_size": 240}, r"image size 240: must be height and width.*\(240, 320\)"),
         ({"image_size": (240.5, 320)}, "image size .*two whole numbers from 1 to 4096"),

@@ -101,7 +101,8 @@ def test_predictions_are_read_and_relative_to_the_start(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         (foretold(predicted_mouth=np.zeros((3, 5, 3))), "'predicted_mouth' is float64"),
-        (foretold(predicted_mouth=np.zeros((1280, 4, 3))), "'predicted_mouth' is float64"),
+        (foretold(predicted_mouth=np.zeros((1280, 25, 3))), r"shape \(1280, 25, 3\); at most 24 H"),
+        (foretold(predicted_mouth=np.zeros((1280, 0, 3))), "'predicted_mouth' is of no frame"),
         (foretold(predicted_mouth=np.full((1280, 5, 3), np.nan)), "holds NaN"),
         (foretold(predicted_mouth=np.zeros((1280, 5, 3), int)), "is int64"),
         (foretold(fps=np.array(25.0)), "of frames at 30 a second, 'fps' is 25.0"),

@@ -337,7 +337,7 @@ def test_the_face_of_an_environment_follows_the_motion() -> None:
     for _ in range(20):
         moved = world.segment.displacement_at(world.time)
         np.testing.assert_allclose(world.mouth_track[0], place + moved, atol=1e-12)
-        times = world.time + np.arange(6) / 30
+        times = world.time + np.arange(25) / 30
         np.testing.assert_allclose(world.mouth_at(times), world.mouth_track, atol=1e-12)
         np.testing.assert_allclose(world.data.body("face/mouth").xpos, place + moved, atol=1e-3)
         env.step(action)

@@ -77,12 +77,14 @@ def recorded(folder: Path, library: Path) -> Path:
         ("current_pred", Corruption("model")),
         ("current_pred", Corruption("model", delay=4, face_dropout=0.2, detector_rate=15.0)),
         ("current", Corruption(delay=3, face_dropout=0.2, detector_rate=20.0)),
+        ("current_pred", Corruption(delay=12, face_dropout=0.2)),
     ],
 )
 def test_training_sees_what_evaluation_sees(
     recorded: Path, library: Path, obs: str, corruption: Corruption
 ) -> None:
-    spec = ObservationSpec(obs=obs, horizon=5, cameras=(), object_pose=True, corruption=corruption)
+    horizon = 24 if corruption.error == "none" else 5
+    spec = ObservationSpec(obs, horizon, cameras=(), object_pose=True, corruption=corruption)
     loaded = load_demonstrations(recorded, spec)
     assert loaded.spec == replace(spec, corruption=corruption.pinned())
     with EpisodeReader(loaded.paths[0]) as episode:

@@ -190,6 +190,46 @@ def test_the_predictors_own_output_is_shown_at_video_frames() -> None:
     np.testing.assert_allclose(error[2], made, atol=1e-12)
 
 
+@pytest.mark.parametrize("error", ["none", *MEASURED, "model"])
+def test_the_first_frames_are_the_same_however_far_ahead_the_truth_goes(error: str) -> None:
+    """Files of older versions know 5 frames, environments 24; a predictor may know fewer."""
+    near = wandering_truth(80, predicted=True)
+    beyond = np.random.default_rng(9).normal(size=(80, 19, 3))
+    far = replace(near, target_position=np.concatenate([near.target_position, beyond], axis=1))
+    corruption = Corruption(error, delay=3, face_dropout=0.2)
+    one, other = (corrupted(corruption, truth, 5) for truth in (near, far))
+    np.testing.assert_array_equal(one.time, other.time)
+    np.testing.assert_array_equal(one.position, other.position[:, :6])
+
+
+@pytest.mark.parametrize(
+    ("frames", "horizon", "message"),
+    [
+        (5, 5, ""),
+        (5, 6, r"holds the predicted mouth 5 frames ahead, not 6; choose a horizon up to 5, "),
+        (1, 1, ""),
+        (1, 2, "1 frames ahead, not 2"),
+        (24, 24, ""),
+    ],
+)
+def test_predictions_must_reach_as_far_as_what_is_shown(
+    frames: int, horizon: int, message: str
+) -> None:
+    truth = replace(
+        wandering_truth(10),
+        target_position=np.zeros((10, 25, 3)),
+        predicted_target=np.ones((10, frames, 3)),
+    )
+    pipeline = CorruptionPipeline(Corruption("model"), horizon)
+    if message:
+        with pytest.raises(RequestError, match=message):
+            pipeline.observe_episode(truth, 0)
+        return
+    shown = pipeline.observe_episode(truth, 0).position
+    np.testing.assert_array_equal(shown[:, 1 : frames + 1], 1.0)
+    np.testing.assert_array_equal(shown[:, frames + 1 :], 0.0)
+
+
 def test_without_predictions_the_model_has_nothing_to_show() -> None:
     truth = wandering_truth(4)
     detector = CorruptionPipeline(Corruption("model"))

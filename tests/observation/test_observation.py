@@ -14,7 +14,7 @@ from robo_manip_baselines.runs.errors import RequestError
 
 from .conftest import NAMES, observe, step_of
 
-POINTS = ((3,), (6, 3), (1, 3))
+POINTS = ((3,), (25, 3), (1, 3))
 """Shapes of gripper, target and objects."""
 
 
@@ -51,7 +51,7 @@ def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
 specs = st.builds(
     ObservationSpec,
     obs=st.sampled_from(["baseline", "current", "current_pred"]),
-    horizon=st.integers(1, 5),
+    horizon=st.integers(1, 24),
     cameras=st.just(()),
     object_pose=st.booleans(),
     arms=st.sampled_from(["right", "both"]),
@@ -86,6 +86,7 @@ def test_a_batch_is_its_members(spec: ObservationSpec) -> None:
         ("current_pred", 1, {"state": 14, "prediction": 10}),
         ("current_pred", 2, {"state": 14, "prediction": 15}),
         ("current_pred", 5, {"state": 14, "prediction": 30}),
+        ("current_pred", 24, {"state": 14, "prediction": 125}),
     ],
 )
 def test_sizes_of_the_papers_presets(obs: str, horizon: int, sizes: dict[str, int]) -> None:
@@ -98,7 +99,7 @@ def test_sizes_of_the_papers_presets(obs: str, horizon: int, sizes: dict[str, in
     [
         {"obs": "all"},
         {"horizon": 0},
-        {"horizon": 6},
+        {"horizon": 25},
         {"cameras": ("side",)},
         {"image_size": (480, 0)},
         {"image_size": (480, 5000)},

@@ -32,6 +32,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ObservationSpec(obs="current", cameras=(), object_pose=True),
         ObservationSpec(obs="current_pred", horizon=1, cameras=()),
         ObservationSpec(obs="current_pred", horizon=5, cameras=(), object_pose=True),
+        ObservationSpec(obs="current_pred", horizon=24, cameras=()),
     ],
 )
 def test_a_file_read_with_a_preset_is_what_the_environment_shows(

@@ -260,7 +260,7 @@ def test_run_folders(line: str, folder: str) -> None:
         ("Act --steps 0", ["steps 0: must be 1 to"]),
         ("Act --chunk_size 0", ["chunk_size 0: must be 1 to"]),
         ("Act --obs all", ["unknown observation preset 'all'", "valid: baseline"]),
-        ("Act --horizon 6", ["horizon 6: must be 1 to 5"]),
+        ("Act --horizon 25", ["horizon 25: must be 1 to 24"]),
         ("Act --error some", ["unknown error model 'some'", "valid: empirical, gaussian"]),
         ("Act --obs current --error uniform", ["'uniform' is one of forecasts", "current_pred"]),
         ("Act --obs baseline --delay 2", ["'delay2' corrupts the mouth"]),

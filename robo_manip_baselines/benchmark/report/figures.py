@@ -194,7 +194,8 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
             axes.plot(places + shift, 100.0 * successes / study.trials, **style)
         last = max(last, *x)
     ticks = range(-1, last + 1)
-    axes.set_xticks(ticks, ["baseline", "current", *map(str, ticks[2:])])
+    current = "current" if last < 10 else "\ncurrent"  # below its neighbour
+    axes.set_xticks(ticks, ["baseline", current, *map(str, ticks[2:])])
     axes.set(xlabel=HORIZON_LABEL, ylabel="success, %", xlim=(-1.4, last + 0.4), ylim=(0.0, 100.0))
     axes.grid(axis="y")
     if axes.get_legend_handles_labels()[1]:

@@ -10,7 +10,6 @@ from itertools import product, starmap
 
 from robo_manip_baselines.observation import (
     ERRORS,
-    MAX_HORIZON,
     PRESETS,
     Corruption,
     ObservationSpec,
@@ -24,8 +23,8 @@ GROUPS = ("Baseline", "Current only", "Current + prediction", "Further condition
 
 BASELINE, CURRENT, PREDICTION, FURTHER = GROUPS
 
-MAX_DELAY = 30
-"""Frames of the latest condition that the rows of version 1 name."""
+MAX_HORIZON, MAX_DELAY = 5, 30
+"""Frames of the longest horizon and of the latest condition that the rows of version 1 name."""
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ ENTRY = TaskEntry(
         *FACE_FIELDS,
         Field(
             "chin_position",
-            ("T", 6, 3),
-            "True chin now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
+            ("T", "K", 3),
+            "True chin now (k = 0) and k = 1…K-1 frames of `prediction_period` ahead: x, y, z",
             "m",
             "world",
         ),

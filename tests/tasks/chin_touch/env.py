@@ -74,7 +74,7 @@ class ChinTouchEnv(FaceEnv):
         self._touch_time: float | None = None
 
     def target_track(self) -> NDArray[np.float64]:
-        """(K, 3) m, world: the true chin now and 1 ... 5 frames ahead."""
+        """(K, 3) m, world: the true chin now and 1 ... 24 frames ahead."""
         return self.landmark_track(CHIN)
 
     @property

@@ -55,7 +55,7 @@ class ExpertView:
     """State that an expert acts on: the present, and the recorded future.
 
     Attributes:
-        target_track: (K, 3) m, world: the target now and 1 ... 5 frames of 1/30 s ahead.
+        target_track: (K, 3) m, world: the target now and 1 ... 24 frames of 1/30 s ahead.
         object_position: (3,) m, world: the object that the gripper takes, if there is one.
         elapsed: s since the approach to the target may begin; None before.
         is_at_target: the task's condition for the end of the approach holds now.
@@ -71,7 +71,7 @@ class ExpertView:
     gripper_position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def target(self, lead: float = 0.0) -> NDArray[np.float64]:
-        """Return the target ``lead`` s ahead, interpolated; (3,) m. At most 5 frames ahead."""
+        """Return the target ``lead`` s ahead, interpolated; (3,) m. At most 24 frames ahead."""
         ahead = np.arange(len(self.target_track)) * FRAME_PERIOD
         return np.array([np.interp(lead, ahead, axis) for axis in self.target_track.T])
 

@@ -1,6 +1,6 @@
 """Recorded face motion: the library that ships with the package, and segments drawn from it.
 
-Shapes: N frames of the whole library, R runs, M frames of a segment, H = 5 frames of a prediction,
+Shapes: N frames of the whole library, R runs, M frames of a segment, H frames of a prediction,
 ``...`` any shape of times.
 """
 
@@ -163,6 +163,11 @@ class MotionLibrary:
             predicted=content[PREDICTION].astype(np.float64) if PREDICTION in content else None,
         )
 
+    @property
+    def predicted_frames(self) -> int:
+        """H, how many frames ahead the predictions look; 0 without predictions."""
+        return 0 if self.predicted is None else self.predicted.shape[1]
+
     @cached_property
     def motion_sha256(self) -> str:
         """SHA-256 of the recorded motion, without predictions; 64 hexadecimal digits."""
@@ -270,11 +275,11 @@ LIBRARY_FILE = FileType(
         "run_length": ArrayType("iu", ("R",), "positive"),
         "run_clip": ArrayType("U", ("R",)),
         "run_subject": ArrayType("U", ("R",)),
-        PREDICTION: ArrayType("f", ("N", MAX_HORIZON, 3), is_optional=True),
+        PREDICTION: ArrayType("f", ("N", "H", 3), is_optional=True),
         "metadata": ArrayType("U"),
     },
     # A day at 30 frames a second, in runs of a second.
-    limits={"N": 2_592_000, "R": 86_400},
+    limits={"N": 2_592_000, "R": 86_400, "H": MAX_HORIZON},
     quaternion_tolerance=1e-3,
 )
 """Arrays of a library file."""
@@ -308,6 +313,8 @@ def _run_problem(content: Arrays) -> str:
         if np.any(np.diff(content["time"][int(first) : int(first) + int(number)]) <= 0):
             return f"'time' does not increase in the run from frame {first} on"
     fps = float(content["fps"])
+    if PREDICTION in content and not content[PREDICTION].shape[1]:
+        return f"'{PREDICTION}' is of no frame ahead"
     if PREDICTION in content and fps != FRAME_RATE:
         return f"'{PREDICTION}' is of frames at {FRAME_RATE:g} a second, 'fps' is {fps}"
     return ""

@@ -1,6 +1,7 @@
 """Replay of a recorded motion: the mouth at every instant of an episode, now and ahead.
 
-Legend: P physics steps, T control steps, K = 6 frames from now to the longest horizon.
+Legend: P physics steps, T control steps, K frames from now to the longest horizon, H frames of a
+forecast.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ FACE_MOTIONS = ("episode", "after_lift")
 been lifted (paper, Algorithm 1, line 12)."""
 
 FRAMES_AHEAD = np.arange(MAX_HORIZON + 1) * FRAME_PERIOD
-"""s ahead at which the true mouth is known: now and at 1 ... 5 frames of 1/30 s."""
+"""s ahead at which the true mouth is known, (K,): now and at 1 ... 24 frames of 1/30 s."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class FaceReplay:
     Attributes:
         bodies: for each mocap body, positions (P, 3) m and orientations (P, 4) wxyz, world.
         mouth: (T, K, 3) m, world: the mouth now and at ``FRAMES_AHEAD``.
-        predicted: (T, K - 1, 3) m, world: the mouth at ``FRAMES_AHEAD`` but for now, as a trained
-            predictor forecast it; None if the recorded motion came without. Exact at video frames;
+        predicted: (T, H, 3) m, world: the mouth 1 ... H frames ahead, as a trained predictor
+            forecast it; None if the recorded motion came without. Exact at video frames;
             between them the predictor's last error is held.
         jaw: (T,) m between the inner lips.
         opening: (T, 2) m, half width and half height of the mouth's opening.
@@ -63,13 +64,16 @@ class FaceReplay:
         """
         physics = np.arange(round(SEGMENT_DURATION / timestep) + 1) * timestep
         displacement, orientation, recorded_jaw = segment.at(physics)
-        ahead, _, _ = segment.at(physics[::substeps, None] + FRAMES_AHEAD)
+        ahead = segment.displacement_at(physics[::substeps, None] + FRAMES_AHEAD)
         error = segment.prediction_error(physics[::substeps])
+        predicted = None
+        if error is not None:
+            predicted = start_position + ahead[:, 1 : error.shape[1] + 1] + error
         jaw = recorded_jaw + REST_OPENING
         return cls(
             bodies=face.body_poses(start_position + displacement, orientation, jaw),
             mouth=start_position + ahead,
             jaw=jaw[::substeps],
             opening=np.stack(face.opening(jaw[::substeps]), axis=-1),
-            predicted=None if error is None else start_position + ahead[:, 1:] + error,
+            predicted=predicted,
         )

@@ -36,7 +36,7 @@ from robo_manip_baselines.observation import (
     ObservedNames,
     State,
 )
-from robo_manip_baselines.observation.corruption import NO_PREDICTION
+from robo_manip_baselines.observation.corruption import prediction_problem
 from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 from robo_manip_baselines.runs.ranges import MAX_SEED
@@ -151,8 +151,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                     f"error model: predictors forecast the mouth, not the {self.task.names.target} "
                     f"of {self.task.name}; choose another error"
                 )
-            if self.library.predicted is None:
-                raise RequestError(f"motion library '{self.library.source}' holds {NO_PREDICTION}")
+            if problem := prediction_problem(self.library.predicted_frames, spec.horizon):
+                raise RequestError(f"motion library '{self.library.source}' holds {problem}")
             if not self.motion.is_as_recorded:
                 raise RequestError(
                     f"error model: predictors have seen recorded motion, not '{self.motion}'; "
@@ -211,11 +211,11 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return {}
 
     def target_track(self) -> Floats:
-        """(K, 3) m, world: the true target now and 1 ... 5 frames ahead; the mouth by default."""
+        """(K, 3) m, world: the true target now and 1 ... 24 frames ahead; the mouth by default."""
         return self.mouth_track
 
     def predicted_target(self) -> Floats | None:
-        """(K - 1, 3) m, world: a predictor's output for the target; None without predictions."""
+        """(H, 3) m, world: a predictor's output for the target; None without predictions."""
         return self.predicted_mouth if self.task.predicted_field else None
 
     # -- indices --------------------------------------------------------------------------------
@@ -419,12 +419,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
     @property
     def mouth_track(self) -> Floats:
-        """(K, 3) m, world: the true mouth now and 1 ... 5 frames ahead."""
+        """(K, 3) m, world: the true mouth now and 1 ... 24 frames ahead."""
         return self.replay.mouth[self._row()].copy()
 
     @property
     def predicted_mouth(self) -> Floats | None:
-        """(K - 1, 3) m, world: the mouth 1 ... 5 frames ahead as forecast by a trained predictor.
+        """(H, 3) m, world: the mouth 1 ... H frames ahead as forecast by a trained predictor.
 
         None if the motion library holds no predictions.
         """
@@ -441,7 +441,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         return MOUTH_BASE + self.face_offset + self.segment.displacement_at(moving)
 
     def landmark_track(self, landmark: int) -> Floats:
-        """(K, 3) m, world: a point of the face now and 1 ... 5 frames ahead.
+        """(K, 3) m, world: a point of the face now and 1 ... 24 frames ahead.
 
         Landmarks are vertices of `FaceModel`, 0 to 467, numbered as MediaPipe does.
         """

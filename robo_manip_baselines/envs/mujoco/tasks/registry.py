@@ -412,15 +412,15 @@ def without_library_path(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 FACE_FIELDS = (
     Field(
         "mouth_position",
-        ("T", 6, 3),
-        "True mouth centre now (k = 0) and k = 1…5 frames of `prediction_period` ahead: x, y, z",
+        ("T", "K", 3),
+        "True mouth centre now (k = 0) and k = 1…K-1 frames of `prediction_period` ahead: x, y, z",
         "m",
         "world",
     ),
     Field(
         "predicted_mouth",
-        ("T", 5, 3),
-        "Mouth centre k = 1…5 frames ahead as forecast by a trained predictor, its last error held "
+        ("T", "H", 3),
+        "Mouth centre k = 1…H frames ahead as forecast by a trained predictor, its last error held "
         "between video frames: x, y, z; only where the recorded motion holds predictions",
         "m",
         "world",

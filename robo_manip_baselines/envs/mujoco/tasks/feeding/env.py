@@ -116,7 +116,7 @@ class FeedingEnv(FaceEnv):
     | name | default | meaning |
     |---|---|---|
     | ``obs`` | ``"baseline"`` | preset: baseline, current, current_pred |
-    | ``horizon`` | 2 | frames that current_pred looks ahead, 1 to 5 |
+    | ``horizon`` | 2 | frames that current_pred looks ahead, 1 to 24 |
     | ``cameras`` | all three | any of top, angle, front_close, or one name; ``()`` for none |
     | ``image_size`` | (480, 640) | height and width |
     | ``render_size`` | None | height and width at which cameras are drawn, before the images are
