@@ -51,6 +51,9 @@ def options(line: str) -> BenchmarkOptions:
         ("feeding --train_seeds 0", "train_seeds 0: must be 1 to"),
         ("feeding --executor ray --num_workers 2", "--executor local"),
         ("feeding --address auto", "--executor ray"),
+        ("feeding --demonstrations 0", "demonstrations 0: must be 1 to"),
+        ("feeding --device tpu", "cpu, cuda"),
+        ("feeding --train_settings steps", "must be NAME=VALUE"),
     ],
 )
 def test_a_wrong_option_is_refused_in_one_line(line: str, words: str) -> None:
@@ -68,6 +71,8 @@ def test_a_wrong_option_is_refused_in_one_line(line: str, words: str) -> None:
         ("feeding --preset smoke --error_stats none.json", "none.json"),
         ("feeding --preset smoke --reference curent", "did you mean 'current'"),
         ("feeding --conditions_file none.yaml", "none.yaml"),
+        ("feeding --preset smoke --train_settings step=3", "did you mean 'steps'"),
+        ("feeding --preset smoke --train_settings steps=-3", "steps"),
     ],
 )
 def test_a_wrong_plan_is_refused_before_anything_is_written(
@@ -89,6 +94,20 @@ def test_a_preset_for_a_gpu_is_refused_where_there_is_none(
     with pytest.raises(RequestError, match="'paper' needs a CUDA device"):
         benchmark(options(f"{line} --out {tmp_path / 'out'}"))
     assert not (tmp_path / "out").exists()
+
+
+def test_size_is_that_of_the_options() -> None:
+    line = "feeding --preset paper --demonstrations 3 --num_episodes 2 --device cpu"
+    given = options(f"{line} --train_settings steps=7 hidden_size=64 --conditions baseline")
+    plan = plan_of(given)
+    (run,) = plan.runs
+    config = run.training.settings["config"]
+    assert [config[name] for name in ("steps", "epochs", "hidden_size")] == [7, None, 64]
+    assert [config["device"], config["preset"]] == ["cpu", "paper"]
+    assert sum(len(range(*item.settings["config"]["seeds"])) for item in run.training.needs) == 3
+    assert sum(len(range(*item.settings["config"]["seeds"])) for item in run.evaluations) == 2
+    default = plan_of(options("feeding --preset paper --conditions baseline")).runs[0].training
+    assert [default.settings["config"][name] for name in ("steps", "epochs")] == [None, 2000]
 
 
 def test_conditions_are_chosen_by_name_and_from_a_file(tmp_path: Path) -> None:

@@ -49,6 +49,7 @@ from robo_manip_baselines.runs.documents import (
     convert,
     load_yaml,
     parse_json,
+    parse_settings,
     parse_yaml,
     read_bytes,
     read_json,
@@ -270,6 +271,22 @@ def test_json_that_is_read() -> None:
     assert parse_json(text, "'file'") == json.loads(text)
     assert parse_json("[" * MAX_DEPTH + "]" * MAX_DEPTH, "'file'")
     assert parse_json('"' + "[" * 1000 + '"', "'file'") == "[" * 1000
+
+
+def test_settings_of_a_command_line() -> None:
+    texts = ["steps=200", "rate=1e-4", "augment=true", "name=wide", "size=48x64", "empty=", "a=b=c"]
+    assert parse_settings(texts, "--set") == {
+        "steps": 200,
+        "rate": 1e-4,
+        "augment": True,
+        "name": "wide",
+        "size": "48x64",
+        "empty": "",
+        "a": "b=c",
+    }
+    for text in ("steps", "=3", ""):
+        with pytest.raises(RequestError, match=f"^--set '{text}': must be NAME=VALUE"):
+            parse_settings([text], "--set")
 
 
 def test_a_large_text_is_refused_before_it_is_parsed() -> None:

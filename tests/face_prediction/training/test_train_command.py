@@ -203,7 +203,7 @@ def test_a_folder_of_another_run_is_refused(finished, change, words: str) -> Non
         ({"settings": ("history=9",)}, "sequences of 8 . 2 frames"),
         ({"settings": ("horizon=3",)}, "needs 6 . 3"),
         ({"settings": ("size=128",)}, "64 pixels, but this network needs 128"),
-        ({"settings": ("width",)}, "--settings width: no value; valid: NAME=VALUE"),
+        ({"settings": ("width",)}, "--settings 'width': must be NAME=VALUE"),
         ({"steps": 0}, "--steps 0"),
         ({"seed": -1}, "--seed -1: must be 0 to"),
         ({"memory_gb": float("nan")}, "--memory_gb nan"),
