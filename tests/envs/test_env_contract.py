@@ -346,6 +346,7 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
         ({"arms": "left"}, "unknown arms 'left'; valid: both, right"),
         ({"arms": None}, "unknown arms 'None'; valid: both, right"),
         ({"face_motion": "never"}, "unknown face motion 'never'"),
+        ({"people": "some"}, "unknown people 'some'; valid: all, test, train"),
         ({"clips": ("nobody",)}, "unknown clip 'nobody'"),
         ({"clips": "nobody"}, "unknown clip 'nobody'"),
         ({"clips": ()}, r"clips \(\): must be ids of clips, at least one"),

@@ -341,6 +341,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "corruption": (dict, type(None)),
     "face_motion": (str,),
     "motion": (str,),
+    "people": (str,),
     "clips": (list, type(None)),
     "motion_library": (str, type(None)),
     "motion_sha256": (str, type(None)),

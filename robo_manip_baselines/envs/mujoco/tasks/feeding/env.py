@@ -129,6 +129,7 @@ class FeedingEnv(FaceEnv):
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
+    | ``people`` | ``"all"`` | all, or train or test: different people, drawn before their starts |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
     | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
     None |
