@@ -226,6 +226,50 @@ def test_no_difference_seen_is_not_no_difference(
 
 
 @pytest.mark.long
+def test_the_declared_end_point_comes_first(
+    make_rows: Callable[..., tuple[ResultRow, ...]],
+) -> None:
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=40)
+    statistics = analyze(rows, task=TASK, headline="success_strict", resamples=50)
+    tables = {table.name: table for table in benchmark_tables(statistics)}
+    names = [name for name in tables if name.endswith("differences")]
+    assert names == ["strict_differences", "success_differences"]
+    assert tables["strict_differences"].title == "Strict success against “Current only”"
+    titles = [column.title for column in tables["success"].columns]
+    assert titles[2:5:2] == ["Strict success", "Success"]
+    best = max(statistics.conditions, key=lambda c: c.strict.rate or 0.0).condition.name
+    strong = [
+        (row.cells[0].values[0], column.title)
+        for row in tables["success"].rows
+        for column, cell in zip(tables["success"].columns, row.cells, strict=True)
+        if cell.is_strong
+    ]
+    assert strong == [(best, "Strict success")]
+    (row,) = tables["strict_differences"].rows
+    won, lost = row.cells[5].values
+    found = statistics.of("baseline").strict_difference
+    assert (won, lost) == (found.wins, found.losses)
+    assert row.cells[5].selection is not None
+    assert row.cells[5].selection.is_strictly_different
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("people", [1, 5])
+def test_intervals_over_people_are_beside_the_others(
+    make_rows: Callable[..., tuple[ResultRow, ...]], people: int
+) -> None:
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=40)
+    if people == 1:
+        rows = tuple(replace(r, result=replace(r.result, motion_subject="me")) for r in rows)
+    tables = benchmark_tables(analyze(rows, task=TASK, resamples=50))
+    (row,) = rows_of(tables, "success_differences").values()
+    assert row["people"] == str(people)
+    assert (row["people_low"] == "") is (people == 1)
+    text = to_markdown(next(t for t in tables if t.name == "success_differences"))
+    assert ("one person" if people == 1 else "(5 people)") in text
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("train_seeds", [1, 2])
 def test_verdicts_on_one_training_run_say_so(
     make_rows: Callable[..., tuple[ResultRow, ...]], train_seeds: int

@@ -137,14 +137,15 @@ def benchmark_figures(statistics: BenchmarkStatistics) -> tuple[ReportFigure, ..
     Raises:
         RequestError: matplotlib is not installed.
     """
+    success = statistics.end_point.capitalize()
     figures: list[tuple[str, str, Draw]] = [
-        ("success_by_horizon", "Success against the horizon", draw_success_by_horizon),
+        ("success_by_horizon", f"{success} against the horizon", draw_success_by_horizon),
         ("completion_times", "Completion times", draw_completion_times),
         *((f.name, f.title, draw_episodes(f)) for f in statistics.study.figures),
         ("failures", "How episodes ended", draw_failures),
     ]
     if any(c.condition.delay for c in statistics.conditions):
-        title = "Success against delay and horizon"
+        title = f"{success} against delay and horizon"
         figures.append(("delay_and_horizon", title, draw_delay_and_horizon))
     return tuple(render_figure(*figure, statistics) for figure in figures)
 
@@ -176,7 +177,7 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
         if not own:
             continue
         x = np.array([-1 if (h := c.condition.horizon) is None else h for c in own])
-        rates = [(c.success.rate, c.success.low, c.success.high) for c in own]
+        rates = [(r.rate, r.low, r.high) for r in map(statistics.rate, own)]
         rate, low, high = 100.0 * np.array(rates, dtype=np.float64).T
         style: Any = {"color": color, "label": f"prediction {label}" if label else None}
         if len(x) > 1:
@@ -187,7 +188,7 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
             errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
             axes.errorbar(place, rate, errors, fmt="o", capsize=4, **style)
         there = [(h, c.published.successes) for h, c in zip(x, own, strict=True) if c.published]
-        if there:
+        if there and statistics.measure == "success":  # the paper's
             places, successes = np.array(there, dtype=np.float64).T
             style = {"mfc": "none", "mec": color, "ms": 6, "ls": "none", "marker": "D"}
             style["label"] = f"paper, {label}" if label else None
@@ -195,7 +196,8 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
         last = max(last, *x)
     ticks = range(-1, last + 1)
     axes.set_xticks(ticks, ["baseline", "current", *map(str, ticks[2:])])
-    axes.set(xlabel=HORIZON_LABEL, ylabel="success, %", xlim=(-1.4, last + 0.4), ylim=(0.0, 100.0))
+    ylabel = f"{statistics.end_point}, %"
+    axes.set(xlabel=HORIZON_LABEL, ylabel=ylabel, xlim=(-1.4, last + 0.4), ylim=(0.0, 100.0))
     axes.grid(axis="y")
     if axes.get_legend_handles_labels()[1]:
         figure.legend(loc="outside lower center", ncols=4, fontsize=9)
@@ -203,10 +205,11 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
         " over training and evaluation seeds" if statistics.has_many_train_seeds else " (Wilson)"
     )
     caption = f"Bands and bars: 95 % intervals{seeds}."
-    if _has_published(statistics):
+    if _has_published(statistics) and statistics.measure == "success":
         caption += f" Hollow markers: {_paper(study.success_table)}, {study.trials} episodes each."
-    best = max(conditions, key=lambda c: c.success.rate or 0.0)
-    return caption, f"The highest rate is that of “{best.condition.label}”, {best.success}."
+    best = max(conditions, key=lambda c: statistics.rate(c).rate or 0.0)
+    highest = f"“{best.condition.label}”, {statistics.rate(best)}"
+    return caption, f"The highest rate is that of {highest}."
 
 
 def draw_completion_times(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
@@ -303,7 +306,7 @@ def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tupl
     errors = {c.condition.error for c in statistics.conditions if c.condition.delay}
     error = min(errors, key=lambda error: (error != "none", error))
     rates = {
-        (c.condition.delay, c.condition.horizon): 100.0 * (c.success.rate or 0.0)
+        (c.condition.delay, c.condition.horizon): 100.0 * (statistics.rate(c).rate or 0.0)
         for c in statistics.conditions
         if c.condition.error == error and c.condition.horizon is not None
     }
@@ -320,7 +323,7 @@ def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tupl
     axes.set_xticks(range(len(horizons)), [str(h) if h else "current" for h in horizons])
     axes.set_yticks(range(len(delays)), map(str, delays))
     axes.set(xlabel=HORIZON_LABEL, ylabel="delay, frames")
-    figure.colorbar(image, ax=axes, label="success, %")
+    figure.colorbar(image, ax=axes, label=f"{statistics.end_point}, %")
     caption = "Empty where no such condition was evaluated."
     if error != "none":
         caption += f" Conditions with {error} error."
