@@ -121,6 +121,7 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
         ("- {name: a, error: unifrom}", ["line 3", "unifrom", "did you mean 'uniform'"]),
         ("- {name: a, obs: curent}", ["line 3", "did you mean 'current'"]),
         ("- {name: a, obs: current, error: uniform}", ["line 3", "forecasts"]),
+        ("- {name: a, obs: history, error: uniform}", ["line 3", "'history' shows none"]),
         ("- {name: a, obs: baseline, delay: 2}", ["line 3", "baseline"]),
         ("- {name: a, policy: Atc}", ["line 3", "did you mean 'Act'"]),
         ("- {name: a, expert: quick}", ["line 3", "anticipatory, reactive"]),

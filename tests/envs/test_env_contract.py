@@ -32,6 +32,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "baseline": {"obs": "baseline"},
     "current": {"obs": "current"},
     "current_pred": {"obs": "current_pred", "horizon": 5},
+    "history": {"obs": "history", "corruption": {"delay": 2}},
     "both arms": {"obs": "current_pred", "horizon": 1, "arms": "both", "motion": "recorded+tremor"},
     "after lift": {"obs": "current", "face_motion": "after_lift"},
 }
@@ -272,6 +273,18 @@ def test_a_copy_goes_on_as_the_original_does(name: str, how: str, error: str) ->
     env.close()
     np.testing.assert_array_equal(twin.reset()[0]["state"].shape, ours[0]["state"].shape)
     twin.close()
+
+
+@pytest.mark.parametrize("how", COPIES)
+def test_a_copy_remembers_the_past(name: str, how: str) -> None:
+    with contextlib.closing(make_env(name, cameras=(), obs="history")) as env:
+        wander(env, seed=2, steps=3)
+        twin = COPIES[how](env)
+        for _ in range(12):
+            action = env.action_space.sample()
+            ours, theirs = env.step(action)[0], twin.step(action)[0]
+            np.testing.assert_array_equal(ours["history"], theirs["history"])
+        twin.close()
 
 
 @pytest.mark.gl

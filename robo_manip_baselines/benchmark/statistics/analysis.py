@@ -243,7 +243,8 @@ def analyze(
             draws = rng(name, f"{measure} difference")
             if compare is paired_success:
                 compare = partial(paired_success, people=people_on_common_seeds(pair))
-            return compare(*on_common_seeds(pair, measure), draws, resamples)
+            ours, theirs = on_common_seeds(pair, measure)
+            return compare(ours, theirs, draws, resamples)
 
         success = rate(own.success, "success")
         return ConditionStatistics(

@@ -105,13 +105,15 @@ def split_runs(
         RequestError: a part has no run that is long enough.
     """
     usable = np.flatnonzero(length >= least)
-    if stored is None and len({people[run] for run in usable}) == 1:
-        return _split_one_person([clips[run] for run in usable], usable, start, length, least)
-    found = stored or (alternate([people[run] for run in usable]) if usable.size else None)
+    present = [people[run] for run in usable.tolist()]
+    if stored is None and len(set(present)) == 1:
+        own = [clips[run] for run in usable.tolist()]
+        return _split_one_person(own, usable, start, length, least)
+    found = stored or (alternate(present) if present else None)
     parts: dict[str, RunPart] = {}
     for name in ("train", "test"):
         wanted: tuple[str, ...] = getattr(found, name, ())
-        runs = np.array([run for run in usable if people[run] in wanted], dtype=np.int64)
+        runs = usable[np.array([name in wanted for name in present], dtype=bool)]
         if not runs.size:
             whose = f" of {', '.join(wanted)}" if wanted else ""
             raise RequestError(f"people '{name}': no run{whose} is long enough for an episode")
