@@ -139,7 +139,7 @@ def test_written_whole_in_three_formats(tmp_path: Path, statistics: BenchmarkSta
     tables = benchmark_tables(statistics)
     paths = write_tables(tmp_path / "tables", tables)
     assert {path.suffix for path in paths} == {".md", ".csv", ".tex"}
-    assert len(set(paths)) == 3 * len(tables) == 24
+    assert len(set(paths)) == 3 * len(tables) == 27
     for path in paths:
         text = path.read_text(encoding="utf-8")
         assert text.endswith("\n")
@@ -201,7 +201,8 @@ def test_one_training_seed_has_no_columns_for_several(
     rows = make_rows(conditions=["shuffled_future"], train_seeds=1, episodes=6)
     tables = benchmark_tables(analyze(rows, task=TASK, resamples=50))
     # Nothing to compare with: neither another condition, nor the paper, nor a finding.
-    assert [table.name for table in tables] == ["success", "completion_times", "failures"]
+    names = ["success", "completion_times", "measures", "failures"]
+    assert [table.name for table in tables] == names
     assert "by_training_seed" not in to_csv(tables[1])
     assert "bootstrap" not in to_markdown(tables[0])
     assert to_markdown(tables[0]).count("**") == 4  # the title, and the best of one
@@ -254,6 +255,22 @@ def test_the_declared_end_point_comes_first(
 
 
 @pytest.mark.long
+def test_further_end_points(make_rows: Callable[..., tuple[ResultRow, ...]]) -> None:
+    """Rows of earlier releases know the peak force alone; a mean is over the rows that know."""
+    rows = list(make_rows(conditions=["baseline"], train_seeds=1, episodes=11))
+    for number, row in enumerate(rows):
+        columns = {**row.result.columns, "face_force": float(number)}
+        if number < 5:
+            columns["dwell"] = 0.1 * number
+        rows[number] = replace(row, result=replace(row.result, columns=columns))
+    (row,) = rows_of(benchmark_tables(analyze(rows, task=TASK, resamples=50)), "measures").values()
+    assert (float(row["face_force"]), float(row["face_force_p90"])) == (5.0, 9.0)
+    assert float(row["dwell"]) == pytest.approx(0.2)
+    assert float(row["dwell_p90"]) == pytest.approx(0.36)
+    assert row["force_time_1"] == ""
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("people", [1, 5])
 def test_intervals_over_people_are_beside_the_others(
     make_rows: Callable[..., tuple[ResultRow, ...]], people: int
@@ -288,7 +305,9 @@ def test_a_task_without_a_study(make_rows: Callable[..., tuple[ResultRow, ...]])
     task = replace(TASK, success_time_limit=None, study="", strict_success="", failures={})
     rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=6)
     tables = {t.name: t for t in benchmark_tables(analyze(rows, task=task, resamples=50))}
-    assert list(tables) == ["success", "success_differences", "completion_times", "failures"]
+    assert list(tables) == [
+        *("success", "success_differences", "completion_times", "measures", "failures"),
+    ]
     assert tables["success"].title == "Success rates"
     assert tables["completion_times"].title == "Completion times"
     assert len(tables["success"].columns) == 6

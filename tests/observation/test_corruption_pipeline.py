@@ -277,8 +277,9 @@ def test_a_report_is_shown_with_its_time_and_the_gripper_of_now() -> None:
     np.testing.assert_array_equal(observe(current, truth, report)["mouth"][:, :3], shown[:, 1:4])
     plain = observe(ObservationSpec(cameras=()), truth)
     np.testing.assert_array_equal(observe(current, truth, report)["state"], plain["state"])
-    history = ObservationSpec("history", cameras=())
-    for wrong in ((spec, None), (ObservationSpec(), report), (history, None)):
+    with pytest.raises(ValueError, match="goes with a pipeline"):
+        ObservationSpec("history", cameras=()).pack(truth)
+    for wrong in ((spec, None), (ObservationSpec(), report)):
         with pytest.raises(ValueError, match="goes with a pipeline"):
             observe(wrong[0], truth, wrong[1])
     assert report.time[-1] == pytest.approx(29 * PERIOD - 0.1)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
+import numpy as np
+
 from robo_manip_baselines.benchmark.statistics.analysis import (
     BenchmarkStatistics,
     ConditionStatistics,
@@ -16,6 +18,7 @@ from robo_manip_baselines.benchmark.statistics.analysis import (
 from robo_manip_baselines.benchmark.statistics.inference import SIGNIFICANCE
 from robo_manip_baselines.benchmark.statistics.outcomes import RowSelection
 from robo_manip_baselines.benchmark.tables.table import NOTHING, Cell, Column, Row, Table
+from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn
 
 VERDICTS = ("verdict", "is_compatible")
 """Names of the columns that answer a question by a word."""
@@ -34,6 +37,7 @@ def benchmark_tables(statistics: BenchmarkStatistics, caution: str = "") -> tupl
         success_beside_paper(statistics),
         times_table(statistics),
         times_beside_paper(statistics),
+        measures_table(statistics),
         failures_table(statistics),
     )
     filled = [table for table in tables if table.rows]
@@ -506,6 +510,41 @@ def times_beside_paper(statistics: BenchmarkStatistics) -> Table:
     title = f"Completion times beside the paper's {study.time_table or 'results'}"
     conditions = [c for c in statistics.conditions if c.published]
     return condition_table("completion_times_beside_paper", title, conditions, columns, notes)
+
+
+def measures_table(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of the task's columns that are end points; without rows where none has any."""
+    shown = [column for column in statistics.task.columns if column.in_tables]
+
+    def title_of(column: ResultColumn) -> str:
+        return column.name.replace("_", " ").capitalize()
+
+    def measure(column: ResultColumn) -> Statistic:
+        def values(c: ConditionStatistics) -> tuple[float | None, float | None]:
+            found = [row.result.columns.get(column.name) for row in c.rows]
+            numbers = [value for value in found if value is not None]
+            if not numbers:
+                return None, None
+            return float(np.mean(numbers)), float(np.percentile(numbers, 90.0))
+
+        name = column.name
+        title = title_of(column) + (f", {column.unit}" if column.unit else "")
+        return Statistic(title, f"{name} {name}_p90", "{:.2f} ({:.2f})".format, values, ALL)
+
+    columns = [
+        Statistic("Episodes", "episodes", str, "outcomes.episodes", ALL),
+        *map(measure, shown),
+    ]
+    notes = ["Mean over all episodes, and the 90th percentile."]
+    notes += [f"{title_of(column)}: {column.description}." for column in shown]
+    has_any = any(
+        row.result.columns.get(column.name) is not None
+        for c in statistics.conditions
+        for row in c.rows
+        for column in shown
+    )
+    conditions = statistics.conditions if has_any else ()
+    return condition_table("measures", "Further end points", conditions, columns, notes)
 
 
 def failures_table(statistics: BenchmarkStatistics) -> Table:
