@@ -9,7 +9,8 @@ import io
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from robo_manip_baselines.benchmark.statistics.conditions import (
     WITH_ERROR,
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import EpisodeFigure
+from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import write_text
@@ -39,6 +41,10 @@ SKY, PINK, YELLOW, GREY = "#56b4e9", "#cc79a7", "#f0e442", "#8c8c8c"
 
 FAILURE_COLORS = (GREY, PINK, BLUE, SKY, RED, ORANGE, YELLOW)
 """Colors of the kinds of failure in their order; further kinds are hatched."""
+
+LEAD_COLORS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, INK)
+LEAD_MARKERS = "osD^"
+"""Colors and markers of the curves over net lead, colors changing first."""
 
 MANY_POINTS = 3000
 """More points are drawn as pixels: as shapes they would make the file large."""
@@ -147,6 +153,9 @@ def benchmark_figures(statistics: BenchmarkStatistics) -> tuple[ReportFigure, ..
     if any(c.condition.delay for c in statistics.conditions):
         title = f"{success} against delay and horizon"
         figures.append(("delay_and_horizon", title, draw_delay_and_horizon))
+    if _shows_net_lead(series := lead_series(statistics)):
+        title = f"{success} against net lead"
+        figures.append(("net_lead", title, partial(draw_net_lead, series=series)))
     return tuple(render_figure(*figure, statistics) for figure in figures)
 
 
@@ -333,6 +342,92 @@ def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tupl
         f"The lowest rate, {rates[delay, horizon]:.0f} %, is at a delay of {delay} frames and a "
         f"horizon of {horizon}.",
     )
+
+
+@dataclass(frozen=True)
+class LeadSeries:
+    """Curve of the end point against net lead: conditions that differ in it alone.
+
+    Attributes:
+        policy: name.
+        motion: of the face.
+        delay: frames by which the observed target is late.
+        points: net lead, frames, -> condition.
+    """
+
+    policy: str
+    motion: str
+    delay: int
+    points: dict[int, ConditionStatistics]
+
+
+def lead_series(statistics: BenchmarkStatistics) -> list[LeadSeries]:
+    """Group the conditions that observe the true present or future by policy, motion and delay.
+
+    Net lead is the horizon minus the delay, in frames: how far ahead of the present, or behind it,
+    the latest target lies that a policy observes. Of several conditions in one place, as with
+    another expert, the first counts.
+    """
+    found: dict[tuple[str, str, int], LeadSeries] = {}
+    for c in statistics.conditions:
+        result = c.rows[0].result
+        horizon, delay, error = c.condition.horizon, c.condition.delay, c.condition.error
+        if result.observation:  # a condition of another name than its spec's has one, too
+            spec = ObservationSpec.from_json(result.observation)
+            is_plain = not replace(spec.corruption, delay=0)
+            horizon = spec.frames - 1 if spec.frames and is_plain and not spec.past_frames else None
+            delay, error = spec.corruption.delay, spec.corruption.error
+        if horizon is None or error != "none":
+            continue
+        key = result.policy, result.motion, delay
+        found.setdefault(key, LeadSeries(*key, {})).points.setdefault(horizon - delay, c)
+    return [found[key] for key in sorted(found)]
+
+
+def _shows_net_lead(series: Sequence[LeadSeries]) -> bool:
+    """Return whether there are three net leads or more, and something else than the horizon."""
+    leads = {lead for own in series for lead in own.points}
+    return len(leads) > 2 and any(own.delay or own.motion != "recorded" for own in series)
+
+
+def draw_net_lead(
+    figure: Any, statistics: BenchmarkStatistics, series: Sequence[LeadSeries]
+) -> tuple[str, str]:
+    """Draw the end point against net lead, one curve for each policy, motion and delay."""
+    figure.set_size_inches(8.0, 4.6)
+    axes = figure.add_subplot()
+    policies = {own.policy for own in series}
+    best: tuple[float, int, str] | None = None
+    for number, own in enumerate(series):
+        label = f"{own.motion}, {own.delay} frames late"
+        label = f"{own.policy}, {label}" if len(policies) > 1 else label
+        leads = sorted(own.points)
+        rates = [statistics.rate(own.points[lead]) for lead in leads]
+        rate, low, high = (
+            100.0 * np.array([(r.rate, r.low, r.high) for r in rates], dtype=np.float64).T
+        )
+        style: Any = {"color": LEAD_COLORS[number % len(LEAD_COLORS)], "label": label}
+        style["fmt"] = f"{LEAD_MARKERS[number // len(LEAD_COLORS) % len(LEAD_MARKERS)]}-"
+        errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
+        shift = 0.06 * (number - (len(series) - 1) / 2)  # bars beside one another
+        axes.errorbar(np.array(leads) + shift, rate, errors, capsize=3, **style)
+        top = max(zip(rate.tolist(), leads, strict=True))
+        best = max(best, (*top, label)) if best else (*top, label)
+    axes.axvline(0.0, color=GREY, lw=1.0, ls=":")
+    ylabel = f"{statistics.end_point}, %"
+    axes.set(
+        xlabel="net lead (horizon − delay), frames of 1/30 s", ylabel=ylabel, ylim=(0.0, 100.0)
+    )
+    axes.grid(axis="y")
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+    caption = (
+        "The latest target that a policy observes, ahead of the present (right) or behind it: its "
+        "latency budget is the delay, and the lag of the arm and the age of the plan come on top. "
+        "Conditions that observe the true present or future; bars: 95 % intervals."
+    )
+    if best is None:
+        return caption, "No condition observes a true target."
+    return caption, f"The highest rate, {best[0]:.0f} %, is at a net lead of {best[1]}: {best[2]}."
 
 
 def _has_published(statistics: BenchmarkStatistics) -> bool:
