@@ -101,8 +101,7 @@ ENTRY = TaskEntry(
             ResultColumn(
                 f"force_time_{limit}",
                 "float",
-                f"s, time with more than {limit} N between robot and face; null in rows of earlier "
-                "releases",
+                f"s, time with more than {limit} N between robot and face",
                 is_optional=True,
                 unit="s",
                 in_tables=True,
@@ -113,8 +112,7 @@ ENTRY = TaskEntry(
         ResultColumn(
             "dwell",
             "float",
-            "s, time in which the held cube's gripper was within the tolerance of `is_success`; "
-            "null in rows of earlier releases",
+            "s, time in which the gripper, the cube held, was within the tolerance of success",
             is_optional=True,
             unit="s",
             in_tables=True,
