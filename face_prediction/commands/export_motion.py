@@ -14,6 +14,7 @@ from face_prediction.motion.library import (
     record_motion,
     save_motion,
     track_files,
+    with_people,
 )
 from face_prediction.motion.motion import MotionSettings
 from face_prediction.motion.report import require_report, write_report
@@ -37,6 +38,8 @@ class ExportMotionOptions:
         attribution: Table (.csv, or Markdown) with the columns clip, subject, ship (yes or no),
             licence, source.
         report: Markdown page to put tables and plots into, between its marks; made if absent.
+        test_people: Subjects of evaluation; all others are those of demonstrations, and the library
+            stores both. If none is given, environments split people by a rule of their own.
         settings: Settings of the motion.
     """
 
@@ -44,6 +47,7 @@ class ExportMotionOptions:
     out: Path = Path("face_motion.npz")
     attribution: Path | None = None
     report: Path | None = None
+    test_people: tuple[str, ...] = ()
     settings: tyro.conf.OmitArgPrefixes[MotionSettings] = field(default_factory=MotionSettings)
 
 
@@ -59,7 +63,7 @@ def run_export_motion(options: ExportMotionOptions) -> None:
         require_report(options.report, [*inputs, options.out], clips)
     require_out_file(options.out, MOTION_LIBRARY, inputs)
     clips, withheld = lift_clips(options.tracks, options.attribution, options.settings)
-    library = record_motion(clips, options.settings, withheld)
+    library = with_people(record_motion(clips, options.settings, withheld), options.test_people)
     save_motion(options.out, library)
     logger.info("%s: %s", options.out, library.summary())
     if options.report is not None:

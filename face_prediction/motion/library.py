@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from face_prediction.motion.motion import (
 )
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES, continuous_quaternions
 from face_prediction.tracking.tracks import load_track
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import FileKind
 from robo_manip_baselines.runs.npz import ArrayType, FileType, read_json_array, read_npz, write_npz
 
@@ -242,6 +242,25 @@ def record_motion(
         "versions": {"numpy": np.__version__, "library_schema": VERSION},
     }
     return join_runs([(c.row.clip, c.row.subject, c.motion) for c in clips], metadata)
+
+
+def with_people(library: RecordedMotion, test: Sequence[str]) -> RecordedMotion:
+    """Store a split of the people in a library: those of ``test``, and everybody else.
+
+    Nothing is stored if ``test`` is empty.
+
+    Raises:
+        RequestError: somebody of ``test`` is not in the library, or nobody else is.
+    """
+    subjects = sorted(set(library.run_subject.tolist()))
+    chosen = {require_choice("subject", name, subjects) for name in test}
+    if not chosen:
+        return library
+    train = [name for name in subjects if name not in chosen]
+    if not train:
+        raise RequestError("--test_people: names everybody; leave somebody for demonstrations")
+    people = {"train": train, "test": sorted(chosen)}
+    return replace(library, metadata={**library.metadata, "people": people})
 
 
 def motion_statistics(motion: ClipMotion, subject: str) -> dict[str, Any]:

@@ -78,6 +78,7 @@ def aggregate_results(
         task=task_entry(plan.env),
         reference=reference,
         conditions=conditions,
+        headline=plan.headline,
     )
 
 
@@ -118,6 +119,7 @@ def write_aggregation(
             "Command": command,
             "Demonstrations": f"{preset.demonstrations} of each expert, "
             + (f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"),
+            "People": str(plan.people),
         }
         title, caution = f"Benchmark {plan.env}", preset.caution
         report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
@@ -134,7 +136,8 @@ def write_aggregation(
 def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
     """Lay out the table that the command prints at its end."""
     rows = {
-        c.condition.label: f"{c.outcomes.episodes:4d} episodes, success {c.success}"
+        c.condition.label: f"{c.outcomes.episodes:4d} episodes, {statistics.end_point} "
+        f"{statistics.rate(c)}"
         for c in statistics.conditions
     }
     return closing_table(rows | {"tables": str(out / TABLES), "report": str(out / REPORT)})

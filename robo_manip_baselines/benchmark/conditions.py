@@ -17,7 +17,9 @@ from typing import Annotated, Any
 from annotated_types import Len
 
 from robo_manip_baselines.benchmark.forecasts import FORECASTS
+from robo_manip_baselines.benchmark.statistics.outcomes import END_POINTS
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
+from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.policy.registry import policy_entry
@@ -161,6 +163,37 @@ _KEYS = _find_keys()
 
 
 @dataclass(frozen=True)
+class DrawnPeople:
+    """People whose motion a benchmark draws, see `MotionLibrary.part`.
+
+    Attributes:
+        demonstrations, evaluation: ``all``, ``train`` or ``test``.
+
+    Raises:
+        RequestError: there are no such people.
+    """
+
+    demonstrations: str = "all"
+    evaluation: str = "all"
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            require_choice(f"people of {item.name}", getattr(self, item.name), PEOPLE)
+
+    def __bool__(self) -> bool:
+        """Return whether anybody is left out anywhere."""
+        return (self.demonstrations, self.evaluation) != ("all", "all")
+
+    def __str__(self) -> str:
+        if not self:
+            return "the same in demonstrations and evaluation"
+        return f"{self.demonstrations} in demonstrations, {self.evaluation} in evaluation"
+
+
+EVERYBODY = DrawnPeople()
+
+
+@dataclass(frozen=True)
 class ConditionsDocument:
     """Content of a file of conditions.
 
@@ -168,11 +201,21 @@ class ConditionsDocument:
         conditions: entries, see `ConditionConfig.from_yaml`.
         env: name of the task.
         presets: name of a preset -> names of its conditions, or ``published``.
+        headline: end point of the benchmark, a key of `END_POINTS`.
+        people: in demonstrations and evaluation.
+
+    Raises:
+        RequestError: there is no such end point.
     """
 
     conditions: Annotated[tuple[Any, ...], Len(1, 1000)]
     env: str = "FeedingEnv"
     presets: dict[str, Any] = field(default_factory=dict)
+    headline: str = "success"
+    people: DrawnPeople = EVERYBODY
+
+    def __post_init__(self) -> None:
+        require_choice("headline", self.headline, END_POINTS)
 
 
 @dataclass(frozen=True)
@@ -183,11 +226,15 @@ class ConditionFile:
         env: name of the task.
         conditions: in their order.
         presets: name of a preset -> names of its conditions; others have all of them.
+        headline: end point of the benchmark, a key of `END_POINTS`.
+        people: in demonstrations and evaluation.
     """
 
     env: str
     conditions: tuple[ConditionConfig, ...]
     presets: Mapping[str, tuple[str, ...]]
+    headline: str = "success"
+    people: DrawnPeople = EVERYBODY
 
     def choose(self, names: Sequence[str]) -> tuple[ConditionConfig, ...]:
         """Return the conditions of these names, in the order of the file.
@@ -226,6 +273,11 @@ def read_conditions(path: Path) -> ConditionFile:
                 raise RequestError(
                     f"the name '{condition.name}' is there twice; choose another one"
                 )
+            if document.people and condition.name in task.load_study().published:
+                raise RequestError(
+                    f"the name '{condition.name}' is that of a condition of the paper, with which "
+                    "it would be compared, and the people are others; choose another name"
+                )
             conditions.append(condition)
         place = ""
         published = tuple(task.load_study().published)
@@ -238,6 +290,8 @@ def read_conditions(path: Path) -> ConditionFile:
                 else convert(names, tuple[str, ...], f"presets.{shortened(name)}")
                 for name, names in document.presets.items()
             },
+            document.headline,
+            document.people,
         )
         for names in file.presets.values():
             file.choose(names)

@@ -9,10 +9,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from robo_manip_baselines.benchmark.conditions import ConditionConfig
+from robo_manip_baselines.benchmark.conditions import (
+    EVERYBODY,
+    ConditionConfig,
+    DrawnPeople,
+)
 from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, WorkItem
 from robo_manip_baselines.benchmark.worker import FORECAST, LIBRARY, STATS
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
+from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
@@ -147,6 +152,8 @@ class Plan:
         preset: the size.
         conditions: in the order of the file.
         library, error_stats: files of the user; None for those that ship with the package.
+        headline: end point that was declared for it, see `ConditionFile`.
+        people: in demonstrations and evaluation.
     """
 
     env: str
@@ -154,6 +161,8 @@ class Plan:
     conditions: tuple[ConditionConfig, ...]
     library: Path | None = None
     error_stats: Path | None = None
+    headline: str = "success"
+    people: DrawnPeople = EVERYBODY
 
     @cached_property
     def runs(self) -> tuple[PlannedRun, ...]:
@@ -206,6 +215,9 @@ class Plan:
         if condition.motion != "recorded":
             variant += f"_{re.sub(r'[^a-z0-9._]+', '-', condition.motion)}"
             env_kwargs["motion"] = condition.motion
+        if (people := self.people.demonstrations) != "all":
+            variant += f"_{people}"
+            env_kwargs["people"] = people
         items = []
         for seeds in _blocks(0, self.preset.demonstrations, self.preset.demonstration_block):
             config = Collection(self.env, Path(OUT), condition.expert, seeds, env_kwargs)
@@ -254,6 +266,7 @@ class Plan:
             checkpoint=Path(MOUNTS["training"]),
             seeds=seeds,
             out=Path(OUT),
+            env_kwargs={"people": self.people.evaluation} if self.people else {},
             num_envs=self.preset.num_envs,
             workers=0,
             device=self.preset.device,
@@ -294,6 +307,8 @@ def make_plan(
     *,
     library: Path | None = None,
     error_stats: Path | None = None,
+    headline: str = "success",
+    people: DrawnPeople = EVERYBODY,
 ) -> Plan:
     """Plan a benchmark.
 
@@ -303,10 +318,13 @@ def make_plan(
         preset: the size.
         library: of recorded motion; the one that ships with the package if None.
         error_stats: of drawn errors; those that ship with the package if None.
+        headline: end point of the benchmark.
+        people: in demonstrations and evaluation.
 
     Raises:
         RequestError: a file cannot be used, a condition needs predictions that the library lacks or
-            errors further ahead than the statistics go, or no policy has a setting.
+            errors further ahead than the statistics go, its people cannot be split, or no policy
+            has a setting.
     """
     motion = MotionLibrary.load(library)
     policies = {condition.policy for condition in conditions}
@@ -314,6 +332,9 @@ def make_plan(
     for name in preset.train_settings:
         require_choice("training setting", name, sorted(set().union(*known)))
     for condition in conditions:
+        if parse_motion(condition.motion).recorded:
+            for part in (people.demonstrations, people.evaluation):
+                motion.part(part)
         if problem := missing_predictions(condition, motion):
             raise RequestError(problem)
     stats = load_error_stats(error_stats)
@@ -329,6 +350,8 @@ def make_plan(
         tuple(condition.for_task(task_entry(env)) for condition in conditions),
         library and library.resolve(),
         error_stats and error_stats.resolve(),
+        headline,
+        people,
     )
 
 

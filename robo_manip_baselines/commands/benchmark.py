@@ -252,6 +252,8 @@ def plan_of(options: BenchmarkOptions) -> Plan:
         options.size,
         library=options.motion_library,
         error_stats=options.error_stats,
+        headline=file.headline,
+        people=file.people,
     )
 
 
@@ -299,6 +301,8 @@ def overview(plan: Plan, items: Sequence[WorkItem], store: ArtifactStore, worker
     seconds = _count_done(progress, items, store)
     rows = {
         "conditions": ", ".join(condition.name for condition in plan.conditions),
+        "end point": plan.headline,
+        "people": str(plan.people),
         **{kind: f"{left[kind]} of {count} items to do" for kind, count in total.items()},
         "done": f"{duration(seconds)} of work, videos apart",
         "workers": str(workers),

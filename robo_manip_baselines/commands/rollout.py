@@ -17,7 +17,7 @@ from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.policy.presets import Chunk
 from robo_manip_baselines.runs.command import last_value, parse
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import require_out_file
 from robo_manip_baselines.runs.progress import closing_table
 from robo_manip_baselines.runs.ranges import Episodes, NonNegativeInt, Processes, Quality, Seed
@@ -107,6 +107,8 @@ class RolloutOptions:
             episode, or as in the demonstrations of the policy.
         motion: Motion of the face: recorded, sway, ..., with parameters sway:amplitude=0.03, or a
             sum recorded+tremor. If not given, recorded, or as in the demonstrations.
+        people: People who move: all, or train or test for demonstrations and evaluation with
+            different people. If not given, all, and test for a policy that learnt from train.
         clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
         motion_library: File of recorded face motion; if not given, the one that ships with the
             package, or that of the demonstrations.
@@ -126,6 +128,7 @@ class RolloutOptions:
     out: Path | None = None
     face_motion: str | None = None
     motion: str | None = None
+    people: str | None = None
     clips: tuple[str, ...] = ()
     motion_library: Path | None = None
     workers: Processes = 2
@@ -146,13 +149,15 @@ class RolloutOptions:
         """Arguments of the environment about the motion that were given.
 
         Raises:
-            RequestError: there is no such motion.
+            RequestError: there are no such motion or people.
         """
         from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
+        from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 
         given = {
             "face_motion": self.face_motion,
             "motion": None if self.motion is None else str(parse_motion(self.motion)),
+            "people": self.people and require_choice("people", self.people, PEOPLE),
             "clips": self.clips,
             "motion_library": self.motion_library and str(self.motion_library),
         }

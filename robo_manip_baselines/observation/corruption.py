@@ -18,7 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from robo_manip_baselines.observation.error_models import DRAWN_ERRORS, WORLD_FROM_IMAGE, Draw
 from robo_manip_baselines.observation.error_stats import load_error_stats
-from robo_manip_baselines.observation.state import FRAME_RATE, Floats, State, TargetObservation
+from robo_manip_baselines.observation.state import (
+    FRAME_PERIOD,
+    FRAME_RATE,
+    Floats,
+    State,
+    TargetObservation,
+)
 from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import (
     RequestError,
@@ -232,13 +238,14 @@ class CorruptionPipeline:
     Args:
         corruption: settings.
         horizon: frames ahead that will be observed.
+        past: frames ago, P, at which what was reported then will be observed, too.
 
     Raises:
         RequestError: the file of error statistics cannot be used.
     """
 
-    def __init__(self, corruption: Corruption, horizon: int = 0) -> None:
-        self.corruption, self.horizon = corruption, horizon
+    def __init__(self, corruption: Corruption, horizon: int = 0, past: int = 0) -> None:
+        self.corruption, self.horizon, self.past = corruption, horizon, past
         self._draw_error: Draw | None = None
         if corruption.error in MEASURED_ERRORS:
             stats = load_error_stats(corruption.error_stats, corruption.stats_sha256)
@@ -268,7 +275,8 @@ class CorruptionPipeline:
             self._draws = self._draw(self._seed, 2 * frames)
         forecast = predicted[0] if predicted else None
         observed = self._observe_at(self._draws, time, position, forecast, time[-1:])
-        return TargetObservation(observed.time[0], observed.position[0])
+        past = None if observed.past is None else observed.past[0]
+        return TargetObservation(observed.time[0], observed.position[0], past)
 
     def observe_episode(self, state: State, seed: int) -> TargetObservation:
         """Return the observed target at every step, (T, ...), as `observe` would have.
@@ -284,7 +292,20 @@ class CorruptionPipeline:
     def _observe_at(
         self, draws: _Draws, time: Floats, position: Floats, predicted: Floats | None, now: Floats
     ) -> TargetObservation:
-        """Observe at the moments ``now`` (n,) s, from the states of the T steps ``time``.
+        """Observe at the moments ``now`` (n,) s, and P frames before each, see `_report_at`."""
+        if not self.past:
+            return self._report_at(draws, time, position, predicted, now)
+        # Before the episode, what was reported at its first moment.
+        moments = np.maximum(now[:, None] - np.arange(self.past + 1) * FRAME_PERIOD, time[0])
+        report = self._report_at(draws, time, position, predicted, moments.ravel())
+        seen = report.time.reshape(moments.shape)
+        track = report.position.reshape(*moments.shape, *report.position.shape[1:])
+        return TargetObservation(seen[:, 0], track[:, 0], track[:, 1:, 0])
+
+    def _report_at(
+        self, draws: _Draws, time: Floats, position: Floats, predicted: Floats | None, now: Floats
+    ) -> TargetObservation:
+        """Return the report at the moments ``now`` (n,) s, from the states of the T steps ``time``.
 
         Of steps later than a moment nothing is used at that moment.
         """

@@ -29,8 +29,11 @@ from robo_manip_baselines.observation.state import (
 from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 
-PRESETS = ("baseline", "current", "current_pred")
-"""The paper's three observation groups (section IV.C)."""
+PRESETS = ("baseline", "current", "current_pred", "history")
+"""The paper's three observation groups (section IV.C), and a control without any forecast."""
+
+HISTORY_FRAMES = 5
+"""Frames of the past that ``history`` shows, as many as the paper's longest forecast has."""
 
 CAMERAS = ("top", "angle", "front_close")
 """The paper's three views (Fig. 8)."""
@@ -94,7 +97,8 @@ class ObservationSpec:
 
     Attributes:
         obs: Preset: baseline (robot and cameras), current (also the mouth and its distance to the
-            gripper) or current_pred (the mouth now and in the next frames).
+            gripper), current_pred (the mouth now and in the next frames) or history (current and
+            the mouth in the 5 frames before).
         horizon: Frames of 1/30 s that current_pred looks ahead, 1 to 24.
         cameras: Cameras, any of top, angle and front_close, or none.
         image_size: Height and width of the images in pixels.
@@ -143,13 +147,14 @@ class ObservationSpec:
         elif not self.frames:
             raise RequestError(
                 f"'{self.corruption.label}' corrupts the mouth, of which the observation preset "
-                f"'{self.obs}' shows nothing; leave it out, or choose current or current_pred"
+                f"'{self.obs}' shows nothing; leave it out, or choose current, history or "
+                "current_pred"
             )
-        elif self.obs == "current" and self.corruption.error != "none":
+        elif self.obs in ("current", "history") and self.corruption.error != "none":
             raise RequestError(
                 f"the error '{self.corruption.error}' is one of forecasts, of which the "
-                "observation preset 'current' shows none; choose current_pred, or the error none "
-                "(delay, face_dropout and detector_rate go with 'current', too)"
+                f"observation preset '{self.obs}' shows none; choose current_pred, or the error "
+                f"none (delay, face_dropout and detector_rate go with '{self.obs}', too)"
             )
 
     def _check_render_size(self) -> None:
@@ -213,13 +218,22 @@ class ObservationSpec:
     @property
     def frames(self) -> int:
         """Number of target positions, from now on, that the preset shows."""
-        return {"baseline": 0, "current": 1, "current_pred": self.horizon + 1}[self.obs]
+        forecast = self.horizon + 1
+        return {"baseline": 0, "current": 1, "current_pred": forecast, "history": 1}[self.obs]
+
+    @property
+    def past_frames(self) -> int:
+        """Number of earlier reports of the target that the preset shows."""
+        return HISTORY_FRAMES if self.obs == "history" else 0
 
     def components(self, names: ObservedNames) -> dict[str, tuple[str, ...]]:
         """Return the names of the elements of every vector of the observation, in order."""
         parts = {"state": tuple(_state_names(self.arm_names))}
-        if self.obs == "current":
+        if self.obs in ("current", "history"):
             parts[names.target] = (*(f"{names.target} {axis}" for axis in "xyz"), "distance")
+        if self.past_frames:
+            ago = range(1, self.past_frames + 1)
+            parts["history"] = tuple(f"{axis}_-{k}" for k in ago for axis in "xyz")
         if self.obs == "current_pred":
             steps = range(self.frames)
             points = [f"{axis}_{k}" for k in steps for axis in "txyz"]
@@ -238,8 +252,15 @@ class ObservationSpec:
         return {f"images/{camera}": camera for camera in self.cameras}
 
     def make_pipeline(self) -> CorruptionPipeline | None:
-        """Return the corruption pipeline; None where the policy is shown the truth."""
-        return CorruptionPipeline(self.corruption, self.frames - 1) if self.corruption else None
+        """Return the corruption pipeline; None where the policy is shown the present truth."""
+        if not self.has_pipeline:
+            return None
+        return CorruptionPipeline(self.corruption, self.frames - 1, self.past_frames)
+
+    @property
+    def has_pipeline(self) -> bool:
+        """True if the target is observed through a pipeline: corrupted, or with its past."""
+        return bool(self.corruption or self.past_frames)
 
     def pack(self, state: State, target: TargetObservation | None = None) -> NDArray[np.float32]:
         """Pack all vectors of an observation into one, (..., S) float32.
@@ -248,10 +269,10 @@ class ObservationSpec:
         the gripper now to the target as observed.
 
         Raises:
-            ValueError: a target is given without a corruption, or the other way round.
+            ValueError: a target is given without a pipeline, or the other way round.
         """
-        if (target is None) != (not self.corruption):
-            raise ValueError("an observed target goes with a corruption, and only with one")
+        if (target is None) == self.has_pipeline:
+            raise ValueError("an observed target goes with a pipeline, and only with one")
         observed = target or TargetObservation(state.time, state.target_position)
         gripper = np.stack([state.gripper_position, state.gripper_velocity], axis=-1)
         arms = np.concatenate([state.joint_position, state.joint_velocity, gripper], axis=-1)
@@ -259,8 +280,10 @@ class ObservationSpec:
         if self.frames:
             position = observed.position[..., : self.frames, :]
             distance = np.linalg.norm(position - state.end_effector_position[..., None, :], axis=-1)
-            if self.obs == "current":
+            if self.obs != "current_pred":
                 parts += [position[..., 0, :], distance]
+                if observed.past is not None:
+                    parts.append(observed.past.reshape(*observed.past.shape[:-2], -1))
             else:
                 time = observed.time[..., None] + np.arange(self.frames) * FRAME_PERIOD
                 timed = np.concatenate([time[..., None], position], axis=-1)
@@ -281,7 +304,7 @@ class ObservationSpec:
     def target_positions(self, vector: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the target positions, (F, 3) m, in a packed vector (S,); F is 0 for baseline."""
         start = len(_state_names(self.arm_names))
-        if self.obs == "current":
+        if self.obs in ("current", "history"):
             return vector[None, start : start + 3].astype(np.float64)
         timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
         return timed[:, 1:].astype(np.float64)

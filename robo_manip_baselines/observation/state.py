@@ -62,7 +62,9 @@ class TargetObservation:
     Attributes:
         time: (...) s since the start of the episode at which it was seen.
         position: (..., K, 3) m, at that time and 1 ... K - 1 frames after it.
+        past: (..., P, 3) m, as it was reported 1 ... P frames ago; None where nobody asks for it.
     """
 
     time: Floats
     position: Floats
+    past: Floats | None = None

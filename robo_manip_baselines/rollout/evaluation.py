@@ -75,7 +75,7 @@ class EvaluationConfig:
         seeds: of the episodes, one each.
         out: folder of the results; ``results/<task>_<run>`` if None.
         env_kwargs: arguments of the environment that differ from those of the demonstrations; held
-            as JSON holds them.
+            as JSON holds them. ``people`` is ``test`` after demonstrations of ``train`` people.
         corruption: of the observations, where it is not the one of the training; None otherwise.
         temporal_ensemble: average the predictions of all chunks, whatever the checkpoint says.
         n_action_steps: actions of a chunk to execute before the next one, where it is not the
@@ -174,6 +174,8 @@ class EvaluationPlan:
             recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
         if "motion" in config.env_kwargs and not parse_motion(config.env_kwargs["motion"]).recorded:
             recorded = {name: value for name, value in recorded.items() if name != "clips"}
+        if recorded.get("people") == "train":  # its clips are of people whom it has seen
+            recorded = {k: v for k, v in recorded.items() if k != "clips"} | {"people": "test"}
         env_kwargs = pin_library({**recorded, **config.env_kwargs})
         env = EnvConfig(checkpoint.env, spec, env_kwargs)
         _require_fit(checkpoint, env)

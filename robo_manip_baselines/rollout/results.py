@@ -139,6 +139,9 @@ class EpisodeResult:
         if "env" not in values:
             raise RequestError(f"{source}: env: is missing")
         task = task_entry(convert(values["env"], str, f"{source}: env"))
+        for column in task.columns:
+            if column.may_be_absent:
+                values.setdefault(column.name, None)
         row = convert(values, row_type(task.name), source)
         if row["failure"] and row["failure"] not in task.failures:
             valid = ", ".join(task.failures)

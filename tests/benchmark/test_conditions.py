@@ -121,6 +121,7 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
         ("- {name: a, error: unifrom}", ["line 3", "unifrom", "did you mean 'uniform'"]),
         ("- {name: a, obs: curent}", ["line 3", "did you mean 'current'"]),
         ("- {name: a, obs: current, error: uniform}", ["line 3", "forecasts"]),
+        ("- {name: a, obs: history, error: uniform}", ["line 3", "'history' shows none"]),
         ("- {name: a, obs: baseline, delay: 2}", ["line 3", "baseline"]),
         ("- {name: a, policy: Atc}", ["line 3", "did you mean 'Act'"]),
         ("- {name: a, expert: quick}", ["line 3", "anticipatory, reactive"]),
@@ -180,6 +181,18 @@ def test_what_is_wrong_is_said_in_one_line_with_its_number(
         ("presets: {smoke: [b]}\nconditions: [{name: a}]", "unknown condition 'b'"),
         ("presets: {smoke: b}\nconditions: [{name: a}]", "presets.smoke: must be a list, not 'b'"),
         ("presets: [b]\nconditions: [{name: a}]", "presets: must be an object"),
+        ("headline: strict\nconditions: [{name: a}]", "unknown headline 'strict'"),
+        ("headline: 3\nconditions: [{name: a}]", "headline: must be text"),
+        ("people: test\nconditions: [{name: a}]", "people: must be an object"),
+        (
+            "people: {evaluation: tests}\nconditions: [{name: a}]",
+            "unknown people of evaluation 'tests'",
+        ),
+        ("people: {training: train}\nconditions: [{name: a}]", "'training'"),
+        (
+            "people: {evaluation: test}\nconditions: [{name: current, obs: current}]",
+            "'current' is that of a condition of the paper",
+        ),
         ("presets: {paper: published}\nconditions: [{name: a}]", "unknown condition 'baseline'"),
     ],
 )
@@ -187,6 +200,18 @@ def test_a_file_of_another_shape_is_refused(text: str, words: str, tmp_path: Pat
     with pytest.raises(RequestError, match=r"mine\.yaml") as refused:
         read_conditions(write(tmp_path, text))
     assert words in str(refused.value)
+
+
+def test_an_end_point_and_people_are_declared(tmp_path: Path) -> None:
+    plain = read_conditions(write(tmp_path, "conditions: [{name: a}]"))
+    assert (plain.headline, bool(plain.people)) == ("success", False)
+    text = "headline: success_strict\npeople: {demonstrations: train, evaluation: test}\n"
+    file = read_conditions(write(tmp_path, f"{text}conditions: [{{name: a}}]"))
+    assert file.headline == "success_strict"
+    assert (file.people.demonstrations, file.people.evaluation) == ("train", "test")
+    assert str(file.people) == "train in demonstrations, test in evaluation"
+    for name in ("feeding", "delay"):
+        assert read_conditions(CONDITIONS / f"{name}.yaml").headline == "success"
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robo_manip_baselines.benchmark import work_item as item_module
-from robo_manip_baselines.benchmark.conditions import CONDITIONS, ConditionConfig, read_conditions
+from robo_manip_baselines.benchmark.conditions import (
+    CONDITIONS,
+    ConditionConfig,
+    DrawnPeople,
+    read_conditions,
+)
 from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.plan import PRESETS, BenchmarkPreset, Plan, make_plan
+from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.errors import RequestError
@@ -60,6 +69,31 @@ def test_a_motion_has_demonstrations_of_its_own_in_which_evaluations_act() -> No
     assert moved.name == "reactive_sway-amplitude-0.03_000000"
     # The checkpoint knows the environment of its demonstrations, and evaluations take it over.
     assert made.runs[1].evaluations[0].settings["config"]["env_kwargs"] == {}
+
+
+def test_people_of_demonstrations_and_evaluation(tmp_path: Path) -> None:
+    swaying = changed(name="sway", motion="sway")
+    apart = make_plan(
+        "FeedingEnv", (changed(name="a"), swaying), PRESET, people=DrawnPeople("train", "test")
+    )
+    for run in apart.runs:
+        (needed, *_), (evaluation, *_) = run.training.needs, run.evaluations
+        assert needed.settings["config"]["env_kwargs"]["people"] == "train"
+        assert "_train_" in needed.name
+        assert evaluation.settings["config"]["env_kwargs"] == {"people": "test"}
+    together = make_plan("FeedingEnv", (changed(name="a"), swaying), PRESET, headline="success")
+    assert not {*(i.key for i in apart.items())} & {*(i.key for i in together.items())}
+    for item in together.items():
+        assert "people" not in json.dumps(item.settings)
+    alone = tmp_path / "alone.npz"
+    content = {**dict(np.load(DEFAULT_LIBRARY)), "run_subject": np.array(["me"] * 9)}
+    for name in ("run_start", "run_length", "run_clip", "run_subject"):
+        content[name] = content[name][1:2]  # one run, too short for two
+    np.savez(alone, **content)
+    for condition, is_possible in ((changed(name="a"), False), (swaying, True)):
+        given = {"library": alone, "people": DrawnPeople("train", "test")}
+        with nullcontext() if is_possible else pytest.raises(RequestError, match="halves are too"):
+            make_plan("FeedingEnv", (condition,), PRESET, **given)
 
 
 def test_two_conditions_that_are_the_same_but_for_the_name_are_trained_twice() -> None:

@@ -134,12 +134,17 @@ def test_pairs_are_those_of_the_rows(
         assert c.success_difference.losses == both.count((False, True))
         assert c.success_difference.difference.n == 200
         assert c.time_difference.difference.n == both.count((True, True))
+        over_people = c.success_difference.over_people
+        assert over_people is not None
+        assert over_people.n == 5
+        assert over_people.mean == c.success_difference.difference.mean
 
 
 @pytest.mark.parametrize(
     ("kind", "tests"),
     [
         ("success_difference", 15),
+        ("strict_difference", 15),
         ("time_difference", 15),
         ("published_success", 12),
         ("published_time", 12),
@@ -151,6 +156,40 @@ def test_each_kind_of_test_is_corrected_over_its_conditions(
     found = [getattr(c, kind) for c in statistics.conditions]
     assert found == holm([replace(comparison, p_holm=None) for comparison in found])
     assert sum(comparison.p is not None for comparison in found) == tests
+
+
+def test_people_of_synthetic_motions_are_others_with_every_seed(make_rows: MakeRows) -> None:
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=30)
+
+    def of(*conditions: str) -> list[ResultRow]:
+        moved = {"motion_clip": "synthetic", "motion_subject": "synthetic", "motion": "sway"}
+        return [
+            replace(row, result=replace(row.result, **moved))
+            if row.result.condition in conditions
+            else row
+            for row in rows
+        ]
+
+    for swaying, people in (((), 5), (("baseline", "current"), 30), (("baseline",), 5)):
+        found = analyze(of(*swaying), task=TASK, resamples=50).of("baseline").success_difference
+        assert found.over_people is not None
+        assert found.over_people.n == people
+
+
+def test_the_declared_end_point_leads(make_rows: MakeRows) -> None:
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=30)
+    plain = analyze(rows, task=TASK, resamples=50)
+    strict = analyze(rows, task=TASK, headline="success_strict", resamples=50)
+    assert (plain.headline, plain.measure, plain.end_point) == ("success", "success", "success")
+    assert (strict.measure, strict.end_point) == ("strict", "strict success")
+    for one, other in zip(plain.conditions, strict.conditions, strict=True):
+        assert (plain.rate(one), strict.rate(other)) == (one.success, one.strict)
+        assert one.strict_difference == other.strict_difference
+    won = {(r.condition, r.seed): r.is_success_strict for r in (row.result for row in rows)}
+    wins = sum(won["baseline", s] and not won["current", s] for s in range(1000, 1030))
+    assert strict.of("baseline").strict_difference.wins == wins
+    with pytest.raises(RequestError, match=r"unknown end point 'strict'.*did you mean"):
+        analyze(rows, task=TASK, headline="strict")
 
 
 def test_intervals_do_not_depend_on_other_conditions(

@@ -71,6 +71,14 @@ def test_a_spec_describes_its_condition() -> None:
         assert describe_condition(name, spec) == looked_up
 
 
+def test_history_has_no_horizon() -> None:
+    """It is no point of the axis on which forecasts lie."""
+    spec = ObservationSpec("history", cameras=(), corruption=Corruption(delay=4))
+    label = "Current and 5 past frames, 4 frames late"
+    wanted = ConditionDescription("history_delay4", label, FURTHER, None, "none", 4)
+    assert describe_condition("history_delay4", spec) == wanted
+
+
 def test_a_condition_that_differs_in_more_than_its_spec_says() -> None:
     spec = ObservationSpec("current_pred", 2, corruption=Corruption("model"))
     assert describe_condition("current_pred_h2_shuffled", spec) == ConditionDescription(

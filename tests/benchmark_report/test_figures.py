@@ -16,6 +16,7 @@ from robo_manip_baselines.benchmark.report.figures import (
     benchmark_figures,
     draw_completion_times,
     draw_episodes,
+    lead_series,
     render_figure,
     write_figures,
 )
@@ -23,6 +24,7 @@ from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatisti
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.envs.mujoco.tasks.feeding.paper import ARRIVALS
+from robo_manip_baselines.observation import Corruption, ObservationSpec
 
 pytestmark = pytest.mark.long
 
@@ -49,6 +51,7 @@ def test_all_are_drawn_and_say_what_is_to_be_seen(
         "arrivals",
         "failures",
         "delay_and_horizon",
+        "net_lead",
     ]
     for figure in figures.values():
         assert figure.title
@@ -80,6 +83,37 @@ def test_numbers_of_the_surface(
     assert [c.condition.delay for c in shown].count(3) == 2
     few = benchmark_figures(replace(statistics, conditions=statistics.conditions[:4]))
     assert [figure.name for figure in few] == list(figures)[:4]
+
+
+def test_net_lead_has_a_curve_for_each_motion_and_delay(
+    figures: dict[str, ReportFigure], make_rows: MakeRows
+) -> None:
+    curves = {"recorded, 0 frames late", "recorded, 3 frames late"}
+    assert curves <= set(words(figures["net_lead"]))
+    names = {
+        "current": ("current", 1, 0, "recorded"),
+        "current_pred_h1": ("current_pred", 5, 4, "sway"),
+        "current_pred_h2": ("current_pred", 2, 4, "sway"),
+        "baseline": ("history", 1, 4, "sway"),
+    }
+    rows = [
+        replace(row, result=replace(row.result, motion=motion, observation=spec.to_json()))
+        for row in make_rows(conditions=list(names), train_seeds=1, episodes=20)
+        for obs, horizon, delay, motion in [names[row.result.condition]]
+        for spec in [ObservationSpec(obs, horizon, (), corruption=Corruption(delay=delay))]
+    ]
+    statistics = analyze(rows, task=TASK, headline="success_strict", resamples=50)
+    found = {(s.motion, s.delay): s.points for s in lead_series(statistics)}
+    assert {key: sorted(points) for key, points in found.items()} == {
+        ("recorded", 0): [0],
+        ("sway", 4): [-2, 1],
+    }
+    assert found["sway", 4][1].condition.name == "current_pred_h1"
+    drawn = {figure.name: figure for figure in benchmark_figures(statistics)}
+    assert drawn["net_lead"].title == "Strict success against net lead"
+    assert "strict success, %" in words(drawn["net_lead"])
+    few = replace(statistics, conditions=statistics.conditions[:2])
+    assert "net_lead" not in [figure.name for figure in benchmark_figures(few)]
 
 
 def test_every_episode_is_drawn_or_counted(statistics: BenchmarkStatistics) -> None:

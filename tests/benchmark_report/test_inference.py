@@ -16,6 +16,7 @@ from robo_manip_baselines.benchmark.statistics.inference import (
     Comparison,
     Estimate,
     bootstrap_mean,
+    clustered_mean,
     hierarchical_mean,
     hierarchical_means,
     holm,
@@ -113,6 +114,84 @@ def test_training_seeds_that_differ_widen_the_interval() -> None:
     assert once.low is not None
     assert once.high is not None
     assert width[0] == pytest.approx(once.high - once.low, rel=0.1)
+
+
+# People.
+
+
+def oracle_cluster_means(
+    grid: np.ndarray, people: list[str], generator: np.random.Generator, resamples: int
+) -> np.ndarray:
+    R, names = len(grid), sorted(set(people))
+    rows = generator.multinomial(R, [1 / R] * R, size=resamples)
+    drawn = generator.multinomial(len(names), [1 / len(names)] * len(names), size=resamples)
+    counts = np.zeros((resamples, len(people)), dtype=int)
+    for place, name in enumerate(names):
+        own = [e for e, person in enumerate(people) if person == name]
+        counts[:, own] = generator.multinomial(
+            drawn[:, place] * len(own), [1 / len(own)] * len(own)
+        )
+    return np.array(
+        [
+            np.nanmean(np.repeat(np.repeat(grid, r, 0), c, 1))
+            for r, c in zip(rows, counts, strict=True)
+        ]
+    )
+
+
+def test_the_bootstrap_over_people_is_that_of_a_few_lines() -> None:
+    grid = rng().normal(size=(3, 24))
+    grid[1, 3:5] = NAN
+    people = [f"person {e % 5}" for e in range(24)]
+    found = clustered_mean(grid, people, rng(2), 400)
+    means = oracle_cluster_means(grid, people, rng(2), 400)
+    assert found.mean == pytest.approx(np.nanmean(grid))
+    assert [found.low, found.high] == pytest.approx(np.percentile(means, [2.5, 97.5]).tolist())
+    assert found.n == 5
+
+
+def test_people_who_differ_widen_the_interval() -> None:
+    people = [f"person {e % 5}" for e in range(100)]
+    alike, unlike = rng().normal(size=(1, 100)), rng().normal(size=(1, 100))
+    unlike += 3.0 * np.arange(5)[np.arange(100) % 5]
+    widths = []
+    for grid in (alike, unlike):
+        found = clustered_mean(grid, people, rng(1))
+        plain = mean_estimate(grid, rng(1))
+        assert None not in (found.low, found.high, plain.low, plain.high)
+        widths.append((found.high - found.low) / (plain.high - plain.low))  # type: ignore[operator]
+    assert widths[0] < 1.6
+    # Means of people have a variance of 3² · 2 beside 1 / 20; P = 5 of them, of episodes 100.
+    assert widths[1] == pytest.approx(math.sqrt(18.05 / 5 / ((18 + 1) / 100)), rel=0.1)
+
+
+def test_everybody_with_one_episode_is_the_bootstrap_over_episodes() -> None:
+    grid = rng().normal(size=(1, 60))
+    found, plain = (
+        clustered_mean(grid, list(map(str, range(60))), rng(1)),
+        mean_estimate(grid, rng(1)),
+    )
+    assert found.low == pytest.approx(plain.low, abs=0.02)
+    assert found.high == pytest.approx(plain.high, abs=0.02)
+
+
+def test_fewer_than_two_people_have_no_interval() -> None:
+    grid = rng().random((1, 4))
+    assert clustered_mean(grid, ["me"] * 4, rng()) == Estimate(grid.mean(), None, None, 1)
+    assert clustered_mean(grid * NAN, ["me"] * 4, rng()) == Estimate(None, None, None, 0)
+    grid[0, :3] = NAN  # the other has no value
+    assert clustered_mean(grid, ["me", "me", "me", "you"], rng()).n == 1
+    assert clustered_mean(np.empty((0, 0)), [], rng()) == Estimate(None, None, None, 0)
+
+
+def test_no_difference_between_few_people_is_no_evidence() -> None:
+    values = np.ones((1, 100))
+    people = ["a", "b", "c", "d"] * 25
+    over_people = paired_success(values, values, rng(), people=people).over_people
+    assert over_people is not None
+    assert over_people.high == pytest.approx(1 - 0.025 ** (1 / 4))
+    alone = paired_success(values, values, rng(), people=["a"] * 100).over_people
+    assert alone == Estimate(0.0, None, None, 1)
 
 
 def test_one_training_seed_takes_the_plain_bootstrap() -> None:

@@ -208,6 +208,9 @@ def test_links() -> None:
     assert link(RowSelection("a", versus=("b,c", "d"), is_different=True)) == (
         "#rows?condition=a&versus=b%252Cc%2Cd&is_different=true"
     )
+    assert link(RowSelection("a", versus=("b",), is_strictly_different=True)) == (
+        "#rows?condition=a&versus=b&is_strictly_different=true"
+    )
     assert link(RowSelection("a", is_strict=True, failure="dropped")) == (
         "#rows?condition=a&is_strict=true&failure=dropped"
     )
@@ -217,6 +220,7 @@ def test_links() -> None:
 def test_facts_of_the_study(statistics: BenchmarkStatistics) -> None:
     assert general_facts(statistics) == {
         "Environment": "FeedingEnv",
+        "End point": "success",
         "Episodes": "3200 of 16 conditions",
         "Training runs": "2 of each condition (seeds 0, 1)",
         "Evaluation seeds": "100 that all conditions have, from 1000 to 1099",

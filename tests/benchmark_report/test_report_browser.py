@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -264,10 +264,13 @@ def test_numbers_open_as_many_rows_as_they_say(opened: Opened) -> None:
         for cell in row.cells[1:3]:
             assert opened.count(link(cell.selection)) == 30  # type: ignore[arg-type]
     for row in tables["success_differences"].rows:
-        pairs, won_lost = row.cells[1], row.cells[4]
+        pairs, won_lost = row.cells[1], row.cells[5]
         won, lost = won_lost.values
         assert opened.count(link(pairs.selection)) == 2 * pairs.values[0]  # type: ignore[arg-type,operator]
         assert opened.count(link(won_lost.selection)) == 2 * (won + lost)  # type: ignore[arg-type,operator]
+        strict = statistics.of(row.cells[0].values[0]).strict_difference  # type: ignore[arg-type]
+        chosen = replace(won_lost.selection, is_different=False, is_strictly_different=True)  # type: ignore[type-var]
+        assert opened.count(link(chosen)) == 2 * (strict.wins + strict.losses)
     for row in tables["completion_times"].rows:
         pairs = row.cells[5]
         if pairs.selection:

@@ -139,7 +139,7 @@ def test_written_whole_in_three_formats(tmp_path: Path, statistics: BenchmarkSta
     tables = benchmark_tables(statistics)
     paths = write_tables(tmp_path / "tables", tables)
     assert {path.suffix for path in paths} == {".md", ".csv", ".tex"}
-    assert len(set(paths)) == 3 * len(tables) == 24
+    assert len(set(paths)) == 3 * len(tables) == 27
     for path in paths:
         text = path.read_text(encoding="utf-8")
         assert text.endswith("\n")
@@ -201,7 +201,8 @@ def test_one_training_seed_has_no_columns_for_several(
     rows = make_rows(conditions=["shuffled_future"], train_seeds=1, episodes=6)
     tables = benchmark_tables(analyze(rows, task=TASK, resamples=50))
     # Nothing to compare with: neither another condition, nor the paper, nor a finding.
-    assert [table.name for table in tables] == ["success", "completion_times", "failures"]
+    names = ["success", "completion_times", "measures", "failures"]
+    assert [table.name for table in tables] == names
     assert "by_training_seed" not in to_csv(tables[1])
     assert "bootstrap" not in to_markdown(tables[0])
     assert to_markdown(tables[0]).count("**") == 4  # the title, and the best of one
@@ -226,6 +227,66 @@ def test_no_difference_seen_is_not_no_difference(
 
 
 @pytest.mark.long
+def test_the_declared_end_point_comes_first(
+    make_rows: Callable[..., tuple[ResultRow, ...]],
+) -> None:
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=40)
+    statistics = analyze(rows, task=TASK, headline="success_strict", resamples=50)
+    tables = {table.name: table for table in benchmark_tables(statistics)}
+    names = [name for name in tables if name.endswith("differences")]
+    assert names == ["strict_differences", "success_differences"]
+    assert tables["strict_differences"].title == "Strict success against “Current only”"
+    titles = [column.title for column in tables["success"].columns]
+    assert titles[2:5:2] == ["Strict success", "Success"]
+    best = max(statistics.conditions, key=lambda c: c.strict.rate or 0.0).condition.name
+    strong = [
+        (row.cells[0].values[0], column.title)
+        for row in tables["success"].rows
+        for column, cell in zip(tables["success"].columns, row.cells, strict=True)
+        if cell.is_strong
+    ]
+    assert strong == [(best, "Strict success")]
+    (row,) = tables["strict_differences"].rows
+    won, lost = row.cells[5].values
+    found = statistics.of("baseline").strict_difference
+    assert (won, lost) == (found.wins, found.losses)
+    assert row.cells[5].selection is not None
+    assert row.cells[5].selection.is_strictly_different
+
+
+@pytest.mark.long
+def test_further_end_points(make_rows: Callable[..., tuple[ResultRow, ...]]) -> None:
+    """Rows of earlier releases know the peak force alone; a mean is over the rows that know."""
+    rows = list(make_rows(conditions=["baseline"], train_seeds=1, episodes=11))
+    for number, row in enumerate(rows):
+        columns = {**row.result.columns, "face_force": float(number)}
+        if number < 5:
+            columns["dwell"] = 0.1 * number
+        rows[number] = replace(row, result=replace(row.result, columns=columns))
+    (row,) = rows_of(benchmark_tables(analyze(rows, task=TASK, resamples=50)), "measures").values()
+    assert (float(row["face_force"]), float(row["face_force_p90"])) == (5.0, 9.0)
+    assert float(row["dwell"]) == pytest.approx(0.2)
+    assert float(row["dwell_p90"]) == pytest.approx(0.36)
+    assert row["force_time_1"] == ""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("people", [1, 5])
+def test_intervals_over_people_are_beside_the_others(
+    make_rows: Callable[..., tuple[ResultRow, ...]], people: int
+) -> None:
+    rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=40)
+    if people == 1:
+        rows = tuple(replace(r, result=replace(r.result, motion_subject="me")) for r in rows)
+    tables = benchmark_tables(analyze(rows, task=TASK, resamples=50))
+    (row,) = rows_of(tables, "success_differences").values()
+    assert row["people"] == str(people)
+    assert (row["people_low"] == "") is (people == 1)
+    text = to_markdown(next(t for t in tables if t.name == "success_differences"))
+    assert ("one person" if people == 1 else "(5 people)") in text
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("train_seeds", [1, 2])
 def test_verdicts_on_one_training_run_say_so(
     make_rows: Callable[..., tuple[ResultRow, ...]], train_seeds: int
@@ -244,7 +305,9 @@ def test_a_task_without_a_study(make_rows: Callable[..., tuple[ResultRow, ...]])
     task = replace(TASK, success_time_limit=None, study="", strict_success="", failures={})
     rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=6)
     tables = {t.name: t for t in benchmark_tables(analyze(rows, task=task, resamples=50))}
-    assert list(tables) == ["success", "success_differences", "completion_times", "failures"]
+    assert list(tables) == [
+        *("success", "success_differences", "completion_times", "measures", "failures"),
+    ]
     assert tables["success"].title == "Success rates"
     assert tables["completion_times"].title == "Completion times"
     assert len(tables["success"].columns) == 6

@@ -32,6 +32,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "baseline": {"obs": "baseline"},
     "current": {"obs": "current"},
     "current_pred": {"obs": "current_pred", "horizon": 5},
+    "history": {"obs": "history", "corruption": {"delay": 2}},
     "both arms": {
         "obs": "current_pred",
         "horizon": 24,
@@ -279,6 +280,18 @@ def test_a_copy_goes_on_as_the_original_does(name: str, how: str, error: str) ->
     twin.close()
 
 
+@pytest.mark.parametrize("how", COPIES)
+def test_a_copy_remembers_the_past(name: str, how: str) -> None:
+    with contextlib.closing(make_env(name, cameras=(), obs="history")) as env:
+        wander(env, seed=2, steps=3)
+        twin = COPIES[how](env)
+        for _ in range(12):
+            action = env.action_space.sample()
+            ours, theirs = env.step(action)[0], twin.step(action)[0]
+            np.testing.assert_array_equal(ours["history"], theirs["history"])
+        twin.close()
+
+
 @pytest.mark.gl
 @pytest.mark.parametrize("how", COPIES)
 def test_a_copy_draws_with_a_context_of_its_own(name: str, how: str) -> None:
@@ -351,6 +364,7 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
         ({"arms": "left"}, "unknown arms 'left'; valid: both, right"),
         ({"arms": None}, "unknown arms 'None'; valid: both, right"),
         ({"face_motion": "never"}, "unknown face motion 'never'"),
+        ({"people": "some"}, "unknown people 'some'; valid: all, test, train"),
         ({"clips": ("nobody",)}, "unknown clip 'nobody'"),
         ({"clips": "nobody"}, "unknown clip 'nobody'"),
         ({"clips": ()}, r"clips \(\): must be ids of clips, at least one"),

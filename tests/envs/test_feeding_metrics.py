@@ -102,6 +102,22 @@ def test_the_closest_approach_counts_only_while_the_cube_is_carried() -> None:
     assert failure == "missed_low"
 
 
+def test_times_above_a_force_and_within_the_tolerance() -> None:
+    """Control steps of 0.02 s; limits themselves are outside, and only a held cube dwells."""
+    at_mouth, edge = (0.0, 0.5, 0.35), (0.029, 0.509, 0.341)
+    metrics = metrics_of(
+        info("grasp", at_mouth, face_force=31.0),
+        info("carry", at_mouth, face_force=30.0),
+        info("carry", (0.031, 0.5, 0.35), face_force=10.5),
+        info("deliver", edge, face_force=1.0),
+        info("deliver", (0.0, 0.5, 0.361), face_force=1.1),
+        info("release", at_mouth),
+    )
+    _, columns = metrics.result(info("release", at_mouth))
+    assert [columns[f"force_time_{limit}"] for limit in (1, 10, 30)] == [0.08, 0.06, 0.02]
+    assert columns["dwell"] == 0.04
+
+
 def test_nearest_is_meant_in_units_of_the_tolerances() -> None:
     """2.9 cm out is nearer than 2 cm low: it is within the tolerance, the other is twice it."""
     metrics = metrics_of(info("carry", (0.029, 0.5, 0.35)), info("carry", (0.0, 0.5, 0.33)))

@@ -75,6 +75,17 @@ def test_the_same_tracks_give_the_same_file(folder: Path, run) -> None:
     assert files[0] == files[1]
 
 
+def test_a_split_of_the_people_is_stored(folder: Path, run, caplog) -> None:
+    table = ("--attribution", folder / "clips.csv", "--test_people")
+    assert run(*table, "ann") == 0
+    people = load_motion(folder / "motion.npz").metadata["people"]
+    assert people == {"train": ["bob"], "test": ["ann"]}
+    assert run(*table, "eve") == 2
+    assert "unknown subject 'eve'; valid: ann, bob" in caplog.text
+    assert run(*table, "ann", "bob") == 2
+    assert "names everybody; leave somebody for demonstrations" in caplog.text
+
+
 def test_without_a_table_nothing_is_claimed(folder: Path, run) -> None:
     assert run() == 0
     attribution = load_motion(folder / "motion.npz").metadata["attribution"]

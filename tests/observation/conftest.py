@@ -111,7 +111,11 @@ def step_of(truth: State, index: int | slice | tuple[int, ...]) -> State:
 def observe(
     spec: ObservationSpec, state: State, target: TargetObservation | None = None
 ) -> dict[str, np.ndarray]:
-    """The vectors of an observation by key."""
+    """The vectors of an observation by key; without a target, nothing was reported before."""
+    if target is None and spec.past_frames:
+        now = state.target_position
+        past = np.repeat(now[..., :1, :], spec.past_frames, axis=-2)
+        target = TargetObservation(state.time, now, past)
     return spec.split(spec.pack(state, target), NAMES)
 
 

@@ -78,6 +78,8 @@ def recorded(folder: Path, library: Path) -> Path:
         ("current_pred", Corruption("model", delay=4, face_dropout=0.2, detector_rate=15.0)),
         ("current", Corruption(delay=3, face_dropout=0.2, detector_rate=20.0)),
         ("current_pred", Corruption(delay=12, face_dropout=0.2)),
+        ("history", Corruption(delay=3)),
+        ("history", Corruption(delay=3, face_dropout=0.2, detector_rate=20.0)),
     ],
 )
 def test_training_sees_what_evaluation_sees(

@@ -28,8 +28,12 @@ MEASURED = ("uniform", "gaussian", "empirical")
 def step_by_step(detector: CorruptionPipeline, truth: State, seed: int) -> TargetObservation:
     detector.reset(seed)
     reports = [detector.observe(step_of(truth, index)) for index in range(len(truth.time))]
-    time, position = zip(*((r.time, r.position) for r in reports), strict=True)
-    return TargetObservation(np.stack(time), np.stack(position))
+    past = [r.past for r in reports if r.past is not None]
+    return TargetObservation(
+        np.stack([r.time for r in reports]),
+        np.stack([r.position for r in reports]),
+        np.stack(past) if past else None,
+    )
 
 
 def corrupted(corruption: Corruption, truth: State, seed: int = 0) -> TargetObservation:
@@ -39,6 +43,9 @@ def corrupted(corruption: Corruption, truth: State, seed: int = 0) -> TargetObse
 def assert_same(one: TargetObservation, other: TargetObservation) -> None:
     np.testing.assert_array_equal(one.time, other.time)
     np.testing.assert_array_equal(one.position, other.position)
+    assert (one.past is None) == (other.past is None)
+    if one.past is not None:
+        np.testing.assert_array_equal(one.past, other.past)
 
 
 corruptions = st.builds(
@@ -54,16 +61,53 @@ corruptions = st.builds(
 
 @pytest.mark.long
 @settings(max_examples=100)
-@given(corruptions, st.integers(0, 2**32), st.integers(1, 60), st.integers(0, 9))
-def test_online_is_offline(corruption: Corruption, seed: int, steps: int, drawn: int) -> None:
+@given(
+    corruptions,
+    st.integers(0, 2**32),
+    st.integers(1, 60),
+    st.integers(0, 9),
+    st.sampled_from([0, 1, 5]),
+)
+def test_online_is_offline(
+    corruption: Corruption, seed: int, steps: int, drawn: int, past: int
+) -> None:
     truth = wandering_truth(steps, drawn, predicted=True)
-    detector = CorruptionPipeline(corruption)
+    detector = CorruptionPipeline(corruption, past=past)
     offline = detector.observe_episode(truth, seed)
     online = step_by_step(detector, truth, seed)
     assert_same(online, offline)
-    assert_same(step_by_step(CorruptionPipeline(corruption), truth, seed), offline)
+    assert_same(step_by_step(CorruptionPipeline(corruption, past=past), truth, seed), offline)
     assert offline.position.shape == (steps, 6, 3)
     assert (offline.time <= truth.time).all()
+
+
+@pytest.mark.long
+@settings(max_examples=50)
+@given(corruptions, st.integers(1, 60), st.integers(0, 9))
+def test_the_past_is_what_was_reported_then(corruption: Corruption, steps: int, drawn: int) -> None:
+    """Steps at 30 a second: the report k frames ago is that of the k-th step before."""
+    truth = wandering_truth(steps, drawn, predicted=True)
+    truth = replace(truth, time=np.arange(steps) / 30.0)
+    report = CorruptionPipeline(corruption, past=5).observe_episode(truth, 3)
+    alone = CorruptionPipeline(corruption).observe_episode(truth, 3)
+    np.testing.assert_array_equal(report.position, alone.position)
+    assert report.past is not None
+    for step in range(steps):
+        for k in range(1, 6):
+            earlier = alone.position[max(step - k, 0), 0]
+            # Times are sums of thirtieths: between two steps lies a part of 1e-14.
+            np.testing.assert_allclose(report.past[step, k - 1], earlier, atol=1e-9)
+
+
+def test_the_past_between_steps_is_interpolated() -> None:
+    truth = wandering_truth(8)
+    truth.target_position[:] = 0.0
+    truth.target_position[:, 0, 0] = 0.01 * np.arange(8)  # 0.5 m/s
+    report = CorruptionPipeline(Corruption(delay=1), past=2).observe_episode(truth, 0)
+    assert report.past is not None
+    wanted = 0.5 * np.maximum(truth.time[:, None] - np.arange(1, 4) / 30, 0.0)
+    np.testing.assert_allclose(report.position[:, 0, 0], wanted[:, 0], atol=1e-12)
+    np.testing.assert_allclose(report.past[:, :, 0], wanted[:, 1:], atol=1e-12)
 
 
 @pytest.mark.long
@@ -73,10 +117,14 @@ def test_nothing_of_later_steps_is_used(corruption: Corruption, steps: int, cut:
     cut = min(cut, steps - 1)
     truth = wandering_truth(steps, predicted=True)
     assert truth.predicted_target is not None
-    whole = corrupted(corruption, truth, 1)
+    pipeline = CorruptionPipeline(corruption, past=5)
+    whole = pipeline.observe_episode(truth, 1)
     truth.target_position[cut:] += 100.0
     truth.predicted_target[cut:] -= 100.0
-    other = corrupted(corruption, truth, 1)
+    other = pipeline.observe_episode(truth, 1)
+    assert whole.past is not None
+    assert other.past is not None
+    np.testing.assert_array_equal(other.past[:cut], whole.past[:cut])
     np.testing.assert_array_equal(other.position[:cut], whole.position[:cut])
     is_changed = not np.array_equal(other.position[-1], whole.position[-1])
     assert is_changed or whole.time[-1] < truth.time[cut]
@@ -269,7 +317,9 @@ def test_a_report_is_shown_with_its_time_and_the_gripper_of_now() -> None:
     np.testing.assert_array_equal(observe(current, truth, report)["mouth"][:, :3], shown[:, 1:4])
     plain = observe(ObservationSpec(cameras=()), truth)
     np.testing.assert_array_equal(observe(current, truth, report)["state"], plain["state"])
+    with pytest.raises(ValueError, match="goes with a pipeline"):
+        ObservationSpec("history", cameras=()).pack(truth)
     for wrong in ((spec, None), (ObservationSpec(), report)):
-        with pytest.raises(ValueError, match="goes with a corruption"):
+        with pytest.raises(ValueError, match="goes with a pipeline"):
             observe(wrong[0], truth, wrong[1])
     assert report.time[-1] == pytest.approx(29 * PERIOD - 0.1)

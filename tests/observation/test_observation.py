@@ -36,8 +36,10 @@ def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
     def distance(k: int) -> float:
         return float(sum((true.target_position[k] - gripper) ** 2) ** 0.5)
 
-    if spec.obs == "current":
+    if spec.obs in ("current", "history"):
         shown["mouth"] = [*true.target_position[0], distance(0)]
+    if spec.obs == "history":  # a single step: nothing but the present was ever reported
+        shown["history"] = 5 * [*true.target_position[0]]
     if spec.obs == "current_pred":
         numbers: list[float] = []
         for k in range(spec.horizon + 1):
@@ -50,7 +52,7 @@ def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
 
 specs = st.builds(
     ObservationSpec,
-    obs=st.sampled_from(["baseline", "current", "current_pred"]),
+    obs=st.sampled_from(["baseline", "current", "current_pred", "history"]),
     horizon=st.integers(1, 24),
     cameras=st.just(()),
     object_pose=st.booleans(),
@@ -87,6 +89,7 @@ def test_a_batch_is_its_members(spec: ObservationSpec) -> None:
         ("current_pred", 2, {"state": 14, "prediction": 15}),
         ("current_pred", 5, {"state": 14, "prediction": 30}),
         ("current_pred", 24, {"state": 14, "prediction": 125}),
+        ("history", 2, {"state": 14, "mouth": 4, "history": 15}),
     ],
 )
 def test_sizes_of_the_papers_presets(obs: str, horizon: int, sizes: dict[str, int]) -> None:

@@ -30,6 +30,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ObservationSpec(obs="baseline", cameras=()),
         ObservationSpec(obs="current", cameras=(), object_pose=True),
+        ObservationSpec(obs="history", cameras=(), object_pose=True),
         ObservationSpec(obs="current_pred", horizon=1, cameras=()),
         ObservationSpec(obs="current_pred", horizon=5, cameras=(), object_pose=True),
         ObservationSpec(obs="current_pred", horizon=24, cameras=()),
@@ -40,8 +41,11 @@ def test_a_file_read_with_a_preset_is_what_the_environment_shows(
 ) -> None:
     kwargs = {"obs": spec.obs, "horizon": spec.horizon, "object_pose": spec.object_pose}
     with EpisodeReader(recorded) as episode, closing(remake_env(episode, **kwargs)) as env:
-        read = observe(spec, recorded_state(episode))
-        shown, _ = env.reset(seed=episode.attributes["seed"])
+        state, seed = recorded_state(episode), episode.attributes["seed"]
+        pipeline = spec.make_pipeline()
+        target = pipeline.observe_episode(state, seed) if pipeline else None
+        read = observe(spec, state, target)
+        shown, _ = env.reset(seed=seed)
         for step, action in enumerate(episode.array("action")):
             for key, value in shown.items():
                 # Sums of squares may be added up in another order for a batch: one float32 ulp.

@@ -343,6 +343,19 @@ def test_options_of_the_environment_come_from_the_demonstrations(
     assert config(run_folder).seeds == range(1000, 1003)
 
 
+def test_a_policy_meets_people_whom_it_has_not_seen(
+    make_checkpoint: MakeCheckpoint, tmp_path: Path
+) -> None:
+    run = tmp_path / "train"
+    recorded = {"people": "train", "clips": ["latentsync_demo2"]}
+    make_checkpoint(run, dataset={"env_kwargs": recorded})
+    assert EvaluationPlan.of(config(run)).env.env_kwargs == {"people": "test"}
+    same = EvaluationPlan.of(config(run, "--people train --clips latentsync_demo2"))
+    assert same.env.env_kwargs == recorded
+    with pytest.raises(RequestError, match=r"unknown people 'tests' .*'test'"):
+        config(run, "--people tests")
+
+
 def test_clips_of_the_demonstrations_are_left_out_where_nothing_is_recorded(
     make_checkpoint: MakeCheckpoint, tmp_path: Path
 ) -> None:

@@ -39,6 +39,10 @@ MISS = EpisodeResult(
         "closest_offset": (0.001, -0.002, -0.012),
         "cube_offset": (-0.011, -0.003, -0.01),
         "face_force": 1.5,
+        "force_time_1": 0.5,
+        "force_time_10": 0.02,
+        "force_time_30": 0.0,
+        "dwell": 0.12,
     },
     policy="Act",
     condition="current_pred_h2",
@@ -90,6 +94,16 @@ def test_a_line_without_a_field_is_refused() -> None:
     del values["face_force"]
     with pytest.raises(ValueError, match="face_force: is missing"):
         EpisodeResult.from_line(json.dumps(values))
+
+
+def test_a_line_of_an_earlier_release_lacks_what_was_not_measured() -> None:
+    values = json.loads(MISS.to_line())
+    added = ("force_time_1", "force_time_10", "force_time_30", "dwell")
+    for name in added:
+        del values[name]
+    read = EpisodeResult.from_line(json.dumps(values))
+    assert read == replace(MISS, columns={**MISS.columns, **dict.fromkeys(added)})
+    assert EpisodeResult.from_line(read.to_line()) == read
 
 
 def test_numbers_that_json_does_not_know_are_not_written() -> None:

@@ -35,6 +35,10 @@ HIT = EpisodeResult(
         "closest_offset": (0.01, 0.0, 0.0),
         "cube_offset": (-0.002, 0.0, 0.0),
         "face_force": 0.0,
+        "force_time_1": 0.0,
+        "force_time_10": 0.0,
+        "force_time_30": 0.0,
+        "dwell": 0.0,
     },
 )
 

@@ -9,7 +9,8 @@ import io
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from robo_manip_baselines.benchmark.statistics.conditions import (
     WITH_ERROR,
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import EpisodeFigure
+from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import write_text
@@ -39,6 +41,10 @@ SKY, PINK, YELLOW, GREY = "#56b4e9", "#cc79a7", "#f0e442", "#8c8c8c"
 
 FAILURE_COLORS = (GREY, PINK, BLUE, SKY, RED, ORANGE, YELLOW)
 """Colors of the kinds of failure in their order; further kinds are hatched."""
+
+LEAD_COLORS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, INK)
+LEAD_MARKERS = "osD^"
+"""Colors and markers of the curves over net lead, colors changing first."""
 
 MANY_POINTS = 3000
 """More points are drawn as pixels: as shapes they would make the file large."""
@@ -137,15 +143,19 @@ def benchmark_figures(statistics: BenchmarkStatistics) -> tuple[ReportFigure, ..
     Raises:
         RequestError: matplotlib is not installed.
     """
+    success = statistics.end_point.capitalize()
     figures: list[tuple[str, str, Draw]] = [
-        ("success_by_horizon", "Success against the horizon", draw_success_by_horizon),
+        ("success_by_horizon", f"{success} against the horizon", draw_success_by_horizon),
         ("completion_times", "Completion times", draw_completion_times),
         *((f.name, f.title, draw_episodes(f)) for f in statistics.study.figures),
         ("failures", "How episodes ended", draw_failures),
     ]
     if any(c.condition.delay for c in statistics.conditions):
-        title = "Success against delay and horizon"
+        title = f"{success} against delay and horizon"
         figures.append(("delay_and_horizon", title, draw_delay_and_horizon))
+    if _shows_net_lead(series := lead_series(statistics)):
+        title = f"{success} against net lead"
+        figures.append(("net_lead", title, partial(draw_net_lead, series=series)))
     return tuple(render_figure(*figure, statistics) for figure in figures)
 
 
@@ -176,7 +186,7 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
         if not own:
             continue
         x = np.array([-1 if (h := c.condition.horizon) is None else h for c in own])
-        rates = [(c.success.rate, c.success.low, c.success.high) for c in own]
+        rates = [(r.rate, r.low, r.high) for r in map(statistics.rate, own)]
         rate, low, high = 100.0 * np.array(rates, dtype=np.float64).T
         style: Any = {"color": color, "label": f"prediction {label}" if label else None}
         if len(x) > 1:
@@ -187,7 +197,7 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
             errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
             axes.errorbar(place, rate, errors, fmt="o", capsize=4, **style)
         there = [(h, c.published.successes) for h, c in zip(x, own, strict=True) if c.published]
-        if there:
+        if there and statistics.measure == "success":  # the paper's
             places, successes = np.array(there, dtype=np.float64).T
             style = {"mfc": "none", "mec": color, "ms": 6, "ls": "none", "marker": "D"}
             style["label"] = f"paper, {label}" if label else None
@@ -196,7 +206,8 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
     ticks = range(-1, last + 1)
     current = "current" if last < 10 else "\ncurrent"  # below its neighbour
     axes.set_xticks(ticks, ["baseline", current, *map(str, ticks[2:])])
-    axes.set(xlabel=HORIZON_LABEL, ylabel="success, %", xlim=(-1.4, last + 0.4), ylim=(0.0, 100.0))
+    ylabel = f"{statistics.end_point}, %"
+    axes.set(xlabel=HORIZON_LABEL, ylabel=ylabel, xlim=(-1.4, last + 0.4), ylim=(0.0, 100.0))
     axes.grid(axis="y")
     if axes.get_legend_handles_labels()[1]:
         figure.legend(loc="outside lower center", ncols=4, fontsize=9)
@@ -204,10 +215,11 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
         " over training and evaluation seeds" if statistics.has_many_train_seeds else " (Wilson)"
     )
     caption = f"Bands and bars: 95 % intervals{seeds}."
-    if _has_published(statistics):
+    if _has_published(statistics) and statistics.measure == "success":
         caption += f" Hollow markers: {_paper(study.success_table)}, {study.trials} episodes each."
-    best = max(conditions, key=lambda c: c.success.rate or 0.0)
-    return caption, f"The highest rate is that of “{best.condition.label}”, {best.success}."
+    best = max(conditions, key=lambda c: statistics.rate(c).rate or 0.0)
+    highest = f"“{best.condition.label}”, {statistics.rate(best)}"
+    return caption, f"The highest rate is that of {highest}."
 
 
 def draw_completion_times(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
@@ -304,7 +316,7 @@ def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tupl
     errors = {c.condition.error for c in statistics.conditions if c.condition.delay}
     error = min(errors, key=lambda error: (error != "none", error))
     rates = {
-        (c.condition.delay, c.condition.horizon): 100.0 * (c.success.rate or 0.0)
+        (c.condition.delay, c.condition.horizon): 100.0 * (statistics.rate(c).rate or 0.0)
         for c in statistics.conditions
         if c.condition.error == error and c.condition.horizon is not None
     }
@@ -321,7 +333,7 @@ def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tupl
     axes.set_xticks(range(len(horizons)), [str(h) if h else "current" for h in horizons])
     axes.set_yticks(range(len(delays)), map(str, delays))
     axes.set(xlabel=HORIZON_LABEL, ylabel="delay, frames")
-    figure.colorbar(image, ax=axes, label="success, %")
+    figure.colorbar(image, ax=axes, label=f"{statistics.end_point}, %")
     caption = "Empty where no such condition was evaluated."
     if error != "none":
         caption += f" Conditions with {error} error."
@@ -331,6 +343,92 @@ def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tupl
         f"The lowest rate, {rates[delay, horizon]:.0f} %, is at a delay of {delay} frames and a "
         f"horizon of {horizon}.",
     )
+
+
+@dataclass(frozen=True)
+class LeadSeries:
+    """Curve of the end point against net lead: conditions that differ in it alone.
+
+    Attributes:
+        policy: name.
+        motion: of the face.
+        delay: frames by which the observed target is late.
+        points: net lead, frames, -> condition.
+    """
+
+    policy: str
+    motion: str
+    delay: int
+    points: dict[int, ConditionStatistics]
+
+
+def lead_series(statistics: BenchmarkStatistics) -> list[LeadSeries]:
+    """Group the conditions that observe the true present or future by policy, motion and delay.
+
+    Net lead is the horizon minus the delay, in frames: how far ahead of the present, or behind it,
+    the latest target lies that a policy observes. Of several conditions in one place, as with
+    another expert, the first counts.
+    """
+    found: dict[tuple[str, str, int], LeadSeries] = {}
+    for c in statistics.conditions:
+        result = c.rows[0].result
+        horizon, delay, error = c.condition.horizon, c.condition.delay, c.condition.error
+        if result.observation:  # a condition of another name than its spec's has one, too
+            spec = ObservationSpec.from_json(result.observation)
+            is_plain = not replace(spec.corruption, delay=0)
+            horizon = spec.frames - 1 if spec.frames and is_plain and not spec.past_frames else None
+            delay, error = spec.corruption.delay, spec.corruption.error
+        if horizon is None or error != "none":
+            continue
+        key = result.policy, result.motion, delay
+        found.setdefault(key, LeadSeries(*key, {})).points.setdefault(horizon - delay, c)
+    return [found[key] for key in sorted(found)]
+
+
+def _shows_net_lead(series: Sequence[LeadSeries]) -> bool:
+    """Return whether there are three net leads or more, and something else than the horizon."""
+    leads = {lead for own in series for lead in own.points}
+    return len(leads) > 2 and any(own.delay or own.motion != "recorded" for own in series)
+
+
+def draw_net_lead(
+    figure: Any, statistics: BenchmarkStatistics, series: Sequence[LeadSeries]
+) -> tuple[str, str]:
+    """Draw the end point against net lead, one curve for each policy, motion and delay."""
+    figure.set_size_inches(8.0, 4.6)
+    axes = figure.add_subplot()
+    policies = {own.policy for own in series}
+    best: tuple[float, int, str] | None = None
+    for number, own in enumerate(series):
+        label = f"{own.motion}, {own.delay} frames late"
+        label = f"{own.policy}, {label}" if len(policies) > 1 else label
+        leads = sorted(own.points)
+        rates = [statistics.rate(own.points[lead]) for lead in leads]
+        rate, low, high = (
+            100.0 * np.array([(r.rate, r.low, r.high) for r in rates], dtype=np.float64).T
+        )
+        style: Any = {"color": LEAD_COLORS[number % len(LEAD_COLORS)], "label": label}
+        style["fmt"] = f"{LEAD_MARKERS[number // len(LEAD_COLORS) % len(LEAD_MARKERS)]}-"
+        errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
+        shift = 0.06 * (number - (len(series) - 1) / 2)  # bars beside one another
+        axes.errorbar(np.array(leads) + shift, rate, errors, capsize=3, **style)
+        top = max(zip(rate.tolist(), leads, strict=True))
+        best = max(best, (*top, label)) if best else (*top, label)
+    axes.axvline(0.0, color=GREY, lw=1.0, ls=":")
+    ylabel = f"{statistics.end_point}, %"
+    axes.set(
+        xlabel="net lead (horizon − delay), frames of 1/30 s", ylabel=ylabel, ylim=(0.0, 100.0)
+    )
+    axes.grid(axis="y")
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+    caption = (
+        "The latest target that a policy observes, ahead of the present (right) or behind it: its "
+        "latency budget is the delay, and the lag of the arm and the age of the plan come on top. "
+        "Conditions that observe the true present or future; bars: 95 % intervals."
+    )
+    if best is None:
+        return caption, "No condition observes a true target."
+    return caption, f"The highest rate, {best[0]:.0f} %, is at a net lead of {best[1]}: {best[2]}."
 
 
 def _has_published(statistics: BenchmarkStatistics) -> bool:

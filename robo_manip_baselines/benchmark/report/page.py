@@ -206,7 +206,7 @@ def link(selection: RowSelection) -> str:
     for name, value in asdict(selection).items():
         if name == "versus" and value:
             query[name] = ",".join(map(quote, value))
-        elif isinstance(value, bool) and (value or name != "is_different"):
+        elif isinstance(value, bool) and (value or not name.endswith("_different")):
             query[name] = str(value).lower()
         elif isinstance(value, str | int | float) and not isinstance(value, bool):
             query[name] = str(value)
@@ -230,6 +230,7 @@ def general_facts(statistics: BenchmarkStatistics) -> dict[str, str]:
             versions.setdefault(name, set()).add(version)
     facts = {
         "Environment": ", ".join(sorted({r.env for r in results})),
+        "End point": statistics.end_point,
         "Episodes": f"{len(results)} of {len(statistics.conditions)} conditions",
         "Training runs": _training_runs(statistics.train_seeds),
         "Evaluation seeds": f"{len(seeds)} that all conditions have"

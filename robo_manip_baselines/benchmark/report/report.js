@@ -64,9 +64,10 @@ function select(query) {
       const key = `${row.trainSeed} ${row.seed}`;
       episodes.set(key, [...(episodes.get(key) ?? []), row]);
     }
-    const differ = query.get("is_different") === "true";
+    const differ = query.get("is_different") === "true" ? "isSuccess"
+      : query.get("is_strictly_different") === "true" ? "isStrict" : null;
     found = [...episodes.values()].filter((episode) => episode.length === conditions.length
-      && (!differ || new Set(episode.map((row) => row.isSuccess)).size > 1)).flat();
+      && (!differ || new Set(episode.map((row) => row[differ])).size > 1)).flat();
     found.sort((a, b) => (a.trainSeed ?? -1) - (b.trainSeed ?? -1) || a.seed - b.seed
       || conditions.indexOf(a.condition) - conditions.indexOf(b.condition));
   }
@@ -77,6 +78,7 @@ function describe(query, count) {
   const parts = [query.get("condition")];
   if (query.has("versus")) parts[0] += ` and ${otherConditions(query).join(", ")}, common seeds`;
   if (query.get("is_different") === "true") parts.push("outcomes that differ");
+  if (query.get("is_strictly_different") === "true") parts.push("strict outcomes that differ");
   if (query.has("is_success")) parts.push(query.get("is_success") === "true" ? "successes" : "failures");
   if (query.has("is_strict")) parts.push("strict successes");
   if (query.has("within")) parts.push(`successes within ${Number(query.get("within"))} s`);

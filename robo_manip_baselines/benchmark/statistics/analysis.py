@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -30,11 +31,13 @@ from robo_manip_baselines.benchmark.statistics.inference import (
     rate_estimate,
 )
 from robo_manip_baselines.benchmark.statistics.outcomes import (
+    END_POINTS,
     Floats,
     OutcomeMatrix,
     ResultRow,
     on_common_seeds,
     outcome_matrix,
+    people_on_common_seeds,
     sorted_train_seeds,
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
@@ -48,7 +51,13 @@ from robo_manip_baselines.rollout.agreement import require_one_comparison
 from robo_manip_baselines.rollout.results import Proportion
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
-_COMPARISONS = ("success_difference", "time_difference", "published_success", "published_time")
+_COMPARISONS = (
+    "success_difference",
+    "strict_difference",
+    "time_difference",
+    "published_success",
+    "published_time",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +74,8 @@ class ConditionStatistics:
         time: s, mean completion time of successes.
         time_by_seed: training seed -> mean, s; None without a success.
         published: result in the paper; None where it has no such condition.
-        success_difference, time_difference: from the reference, on common seeds; `NO_COMPARISON`
-            for the reference itself.
+        success_difference, strict_difference, time_difference: from the reference, on common seeds;
+            `NO_COMPARISON` for the reference itself.
         published_success, published_time: against the paper, likewise without such a condition.
     """
 
@@ -81,6 +90,7 @@ class ConditionStatistics:
     time_by_seed: dict[int | None, float | None]
     published: PublishedResult | None = None
     success_difference: Comparison = NO_COMPARISON
+    strict_difference: Comparison = NO_COMPARISON
     time_difference: Comparison = NO_COMPARISON
     published_success: Comparison = NO_COMPARISON
     published_time: Comparison = NO_COMPARISON
@@ -121,6 +131,7 @@ class BenchmarkStatistics:
         reference: name of the condition that the others are compared with.
         seeds: evaluation seeds that all conditions have, with every training seed.
         findings: on the claims whose conditions were all evaluated.
+        headline: end point that was declared before anything was run, a key of `END_POINTS`.
     """
 
     task: TaskEntry
@@ -129,6 +140,21 @@ class BenchmarkStatistics:
     reference: str
     seeds: tuple[int, ...]
     findings: tuple[Finding, ...]
+    headline: str = "success"
+
+    @property
+    def measure(self) -> str:
+        """Measure of the end point: ``success`` or ``strict``."""
+        return END_POINTS[self.headline]
+
+    @property
+    def end_point(self) -> str:
+        """End point in words: ``success`` or ``strict success``."""
+        return "strict success" if self.measure == "strict" else "success"
+
+    def rate(self, condition: ConditionStatistics) -> Proportion:
+        """Return the rate of the end point in a condition."""
+        return condition.strict if self.measure == "strict" else condition.success
 
     def of(self, name: str) -> ConditionStatistics:
         """Return the statistics of a condition by its name.
@@ -155,6 +181,7 @@ def analyze(
     task: TaskEntry,
     reference: str | None = None,
     conditions: Mapping[str, ConditionDescription] | None = None,
+    headline: str = "success",
     seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> BenchmarkStatistics:
@@ -170,13 +197,15 @@ def analyze(
             first one where that was not evaluated.
         conditions: name -> description of conditions whose rows do not describe them; may hold
             others, too.
+        headline: end point of tables and figures, ``success`` or ``success_strict``.
         seed: of the resampling.
         resamples: of each bootstrap.
 
     Raises:
         RequestError: there are no rows, none of the reference, or rows that do not belong together,
-            see `require_one_comparison`.
+            see `require_one_comparison`; or no such end point.
     """
+    require_choice("end point", headline, END_POINTS)
     if not rows:
         raise RequestError("there are no result rows; evaluate a condition first")
     require_one_comparison([row.result for row in rows])
@@ -210,8 +239,12 @@ def analyze(
         def difference(compare: Callable[..., Comparison], measure: str) -> Comparison:
             if name == reference:
                 return NO_COMPARISON
-            ours, theirs = on_common_seeds([own, outcomes[reference]], measure)
-            return compare(ours, theirs, rng(name, f"{measure} difference"), resamples)
+            pair = [own, outcomes[reference]]
+            draws = rng(name, f"{measure} difference")
+            if compare is paired_success:
+                compare = partial(paired_success, people=people_on_common_seeds(pair))
+            ours, theirs = on_common_seeds(pair, measure)
+            return compare(ours, theirs, draws, resamples)
 
         success = rate(own.success, "success")
         return ConditionStatistics(
@@ -229,6 +262,7 @@ def analyze(
             },
             published=published,
             success_difference=difference(paired_success, "success"),
+            strict_difference=difference(paired_success, "strict"),
             time_difference=difference(paired_times, "time"),
             published_success=published_success(success, own.episodes, published, study.trials),
             published_time=published_time(own.time, published, study.time_rounding),
@@ -241,7 +275,9 @@ def analyze(
     claims = [claim for claim in study.claims if set(claim.weights) <= set(outcomes)]
     findings = tuple(_finding(claim, study, outcomes, seed, resamples) for claim in claims)
     seeds = set.intersection(*(own.complete_seeds for own in outcomes.values()))
-    return BenchmarkStatistics(task, study, tuple(found), reference, tuple(sorted(seeds)), findings)
+    return BenchmarkStatistics(
+        task, study, tuple(found), reference, tuple(sorted(seeds)), findings, headline
+    )
 
 
 def _generator(seed: int, text: str) -> np.random.Generator:

@@ -36,7 +36,7 @@ class ConditionDescription:
         label: for readers.
         group: one of ``GROUPS``.
         horizon: frames of the forecast; 0 for the present position alone; None where the policy
-            is not shown the target, or the observation is not known.
+            is not shown the target, or its past, or the observation is not known.
         error: error of the forecast; ``none`` without.
         delay: frames by which the observed target is late.
 
@@ -75,9 +75,11 @@ def describe_condition(
     error, delay = spec.corruption.error, spec.corruption.delay
     if _spec_with(spec.obs, spec.horizon, error, delay).name != name:
         return ConditionDescription(name, label or name, FURTHER)
-    group = GROUPS[PRESETS.index(spec.obs)]
-    horizon = spec.frames - 1 if spec.frames else None
+    group = FURTHER if spec.past_frames else GROUPS[PRESETS.index(spec.obs)]
+    horizon = spec.frames - 1 if spec.frames and not spec.past_frames else None
     made = f"Prediction, {_frames(spec.horizon)}" if group == PREDICTION else group
+    if spec.past_frames:
+        made = f"Current and {spec.past_frames} past frames"
     if error != "none":
         made += ", with error" if error == WITH_ERROR else f", {error} error"
     if delay:

@@ -150,14 +150,68 @@ def hierarchical_means(grid: Floats, rng: np.random.Generator, resamples: int) -
     Returns:
         (B,) means; NaN for a resample without any value.
     """
-    R, E = grid.shape
-    # Counts of each seed are enough: the order does not matter to a mean.
-    rows_BR = rng.multinomial(R, np.full(R, 1.0 / R), size=resamples).astype(np.float64)
+    _, E = grid.shape
+    rows_BR = _resampled_rows(grid, rng, resamples)
     columns_BE = rng.multinomial(E, np.full(E, 1.0 / E), size=resamples).astype(np.float64)
+    return _resampled_means(grid, rows_BR, columns_BE)
+
+
+def clustered_mean(
+    grid: Floats, people: Sequence[str], rng: np.random.Generator, resamples: int = RESAMPLES
+) -> Estimate:
+    """Return the mean of a grid with an interval over other people, not only over other episodes.
+
+    The percentile interval of a bootstrap that resamples training seeds, then people, then the
+    evaluation seeds of each person drawn. With few people it is too narrow: a sample of P people
+    has about (P - 1)/P of their variance.
+
+    Args:
+        grid: (R, E), NaN where there is no value.
+        people: E names, who moved in the episodes of each evaluation seed.
+        rng: of the resampling.
+        resamples: B.
+
+    Returns:
+        The estimate, whose ``n`` is the number of people with a value; without an interval where
+        there are fewer than two.
+    """
+    grid, is_there = grid[np.isfinite(grid).any(axis=1)], np.isfinite(grid).any(axis=0)
+    if not is_there.any():
+        return Estimate(None, None, None, 0)
+    grid = grid[:, is_there]
+    names, person_E = np.unique(np.asarray(people)[is_there], return_inverse=True)
+    mean, P = float(np.nanmean(grid)), len(names)
+    if P < 2:
+        return Estimate(mean, None, None, P)
+    rows_BR = _resampled_rows(grid, rng, resamples)
+    times_BP = rng.multinomial(P, np.full(P, 1.0 / P), size=resamples)
+    columns_BE = np.empty((resamples, grid.shape[1]))
+    for person, times_B in enumerate(times_BP.T):
+        own = np.flatnonzero(person_E == person)
+        # Somebody who is drawn twice has episodes drawn twice, independently.
+        shares = np.full(len(own), 1.0 / len(own))
+        columns_BE[:, own] = rng.multinomial(times_B * len(own), shares)
+    means = _resampled_means(grid, rows_BR, columns_BE)
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.nanpercentile(means, [tail, 100.0 - tail])
+    return Estimate(mean, float(low), float(high), P)
+
+
+def _resampled_rows(grid: Floats, rng: np.random.Generator, resamples: int) -> Floats:
+    """Draw training seeds; return how often each is there, (B, R)."""
+    R = len(grid)
+    return rng.multinomial(R, np.full(R, 1.0 / R), size=resamples).astype(np.float64)
+
+
+def _resampled_means(grid: Floats, rows_BR: Floats, columns_BE: Floats) -> Floats:
+    """Return means (B,) of a grid (R, E), given how often each row and column is there.
+
+    Counts are enough: the order does not matter to a mean. NaN for a resample without any value.
+    """
     is_there = np.isfinite(grid)
     sums_B = np.einsum("be,be->b", rows_BR @ np.where(is_there, grid, 0.0), columns_BE)
     counts_B = np.einsum("be,be->b", rows_BR @ is_there.astype(np.float64), columns_BE)
-    return np.divide(sums_B, counts_B, out=np.full(resamples, np.nan), where=counts_B > 0)
+    return np.divide(sums_B, counts_B, out=np.full(len(sums_B), np.nan), where=counts_B > 0)
 
 
 @dataclass(frozen=True)
@@ -170,6 +224,8 @@ class Comparison:
         p_holm: Holm-corrected over the conditions of a benchmark; None before that.
         wins: of success rates on common seeds: episodes in which only this condition succeeded.
         losses: likewise, only the other.
+        over_people: of success rates: the same difference with the interval of `clustered_mean`;
+            ``n`` is the number of people. None where nothing was compared.
     """
 
     difference: Estimate
@@ -177,6 +233,7 @@ class Comparison:
     p_holm: float | None = None
     wins: int = 0
     losses: int = 0
+    over_people: Estimate | None = None
 
 
 NO_COMPARISON = Comparison(Estimate(None, None, None, 0), None)
@@ -184,12 +241,17 @@ NO_COMPARISON = Comparison(Estimate(None, None, None, 0), None)
 
 
 def paired_success(
-    ours: Floats, theirs: Floats, rng: np.random.Generator, resamples: int = RESAMPLES
+    ours: Floats,
+    theirs: Floats,
+    rng: np.random.Generator,
+    resamples: int = RESAMPLES,
+    people: Sequence[str] | None = None,
 ) -> Comparison:
     """Compare success rates by McNemar's exact test on pairs of episodes.
 
-    The interval is a bootstrap over the common seeds, hierarchical with several training seeds.
-    Without any differing episode, a bootstrap has no width; see `bound_unseen`.
+    The interval is a bootstrap over the common seeds, hierarchical with several training seeds;
+    given the people, there is another one over them, see `clustered_mean`. Without any differing
+    episode, a bootstrap has no width; see `bound_unseen`.
 
     McNemar's test takes the training runs as given: it is about the trained policies.
 
@@ -198,25 +260,33 @@ def paired_success(
         theirs: (R, E), NaN in the same places.
         rng: of the resampling.
         resamples: of the bootstrap.
+        people: E names, who moved in the episodes of each evaluation seed.
     """
     difference = mean_estimate(ours - theirs, rng, resamples)
+    over_people = None
+    if people is not None:
+        over_people = clustered_mean(ours - theirs, people, rng, resamples)
     wins, losses = int((ours > theirs).sum()), int((ours < theirs).sum())
     if difference.n == 0:
-        return Comparison(difference, None)
+        return Comparison(difference, None, over_people=over_people)
     from statsmodels.stats.contingency_tables import mcnemar  # slow to import
 
     if wins == losses == 0:
         difference = bound_unseen(difference)
+        if over_people is not None and over_people.low is not None:
+            over_people = bound_unseen(over_people)
     both = int(((ours == 1.0) & (theirs == 1.0)).sum())
     neither = difference.n - both - wins - losses
     test: Any = mcnemar([[both, wins], [losses, neither]], exact=True)
-    return Comparison(difference, float(test.pvalue), wins=wins, losses=losses)
+    return Comparison(
+        difference, float(test.pvalue), wins=wins, losses=losses, over_people=over_people
+    )
 
 
 def bound_unseen(difference: Estimate) -> Estimate:
     """Return a difference of rates without any differing episode with Clopper and Pearson's bounds.
 
-    They are those of an event seen 0 times in n, in both directions.
+    They are those of an event seen 0 times in n, in both directions; n may be that of people.
     """
     from statsmodels.stats.proportion import proportion_confint  # slow to import
 

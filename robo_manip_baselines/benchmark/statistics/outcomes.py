@@ -13,11 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.envs.mujoco.face.motions import SYNTHETIC
 from robo_manip_baselines.rollout.agreement import require_one_condition
 from robo_manip_baselines.rollout.results import EpisodeResult, read_rows
 from robo_manip_baselines.runs.errors import RequestError
 
 Floats = NDArray[np.float64]
+
+END_POINTS = {"success": "success", "success_strict": "strict"}
+"""End point that a benchmark may declare -> its measure in an `OutcomeMatrix`."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class RowSelection:
         versus: names of other conditions. The rows of all of them are selected then, for training
             and evaluation seeds that all have (and, with ``is_success``, at which all succeeded).
         is_different: with ``versus``: only seeds at which some succeeded and others failed.
+        is_strictly_different: likewise, of strict success.
     """
 
     condition: str
@@ -59,6 +64,7 @@ class RowSelection:
     failure: str | None = None
     versus: tuple[str, ...] = ()
     is_different: bool = False
+    is_strictly_different: bool = False
 
 
 def read_result_rows(files: Iterable[Path], root: Path | None = None) -> tuple[ResultRow, ...]:
@@ -103,6 +109,8 @@ class OutcomeMatrix:
         success: (R, E) 1 or 0.
         strict: (R, E) likewise, of ``is_success_strict``.
         time: (R, E) s, completion times; NaN without success, too.
+        people: E of them, who moved in the episodes of each evaluation seed. A synthetic motion is
+            another person with every seed.
     """
 
     train_seeds: tuple[int | None, ...]
@@ -110,6 +118,7 @@ class OutcomeMatrix:
     success: Floats
     strict: Floats
     time: Floats
+    people: tuple[str, ...]
 
     @property
     def episodes(self) -> int:
@@ -153,6 +162,27 @@ def outcome_matrix(rows: Sequence[ResultRow]) -> OutcomeMatrix:
         success=matrix(lambda r: r.is_success),
         strict=matrix(lambda r: r.is_success_strict),
         time=matrix(lambda r: r.completion_time if r.is_success else None),
+        people=tuple(_people(results)[seed] for seed in seeds),
+    )
+
+
+def _people(results: Iterable[EpisodeResult]) -> dict[int, str]:
+    """Map evaluation seeds to the people who moved."""
+    return {
+        r.seed: f"{SYNTHETIC} {r.seed}" if r.motion_clip == SYNTHETIC else r.motion_subject
+        for r in results
+    }
+
+
+def people_on_common_seeds(outcomes: Sequence[OutcomeMatrix]) -> tuple[str, ...]:
+    """Return who moved on the seeds that several conditions have, E', see `on_common_seeds`.
+
+    Where conditions differ in their motions, the people of the one with the fewest count.
+    """
+    people = [dict(zip(own.seeds, own.people, strict=True)) for own in outcomes]
+    columns = [s for s in outcomes[0].seeds if all(s in other for other in people)]
+    return min(
+        (tuple(own[s] for s in columns) for own in people), key=lambda names: len(set(names))
     )
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
+import numpy as np
+
 from robo_manip_baselines.benchmark.statistics.analysis import (
     BenchmarkStatistics,
     ConditionStatistics,
@@ -16,6 +18,7 @@ from robo_manip_baselines.benchmark.statistics.analysis import (
 from robo_manip_baselines.benchmark.statistics.inference import SIGNIFICANCE
 from robo_manip_baselines.benchmark.statistics.outcomes import RowSelection
 from robo_manip_baselines.benchmark.tables.table import NOTHING, Cell, Column, Row, Table
+from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn
 
 VERDICTS = ("verdict", "is_compatible")
 """Names of the columns that answer a question by a word."""
@@ -30,14 +33,20 @@ def benchmark_tables(statistics: BenchmarkStatistics, caution: str = "") -> tupl
         findings_table(statistics),
         success_table(statistics),
         success_by_training_seed(statistics),
-        success_differences(statistics),
+        *(success_differences(statistics, measure) for measure in _compared(statistics)),
         success_beside_paper(statistics),
         times_table(statistics),
         times_beside_paper(statistics),
+        measures_table(statistics),
         failures_table(statistics),
     )
     filled = [table for table in tables if table.rows]
     return tuple(without_verdicts(table, caution) if caution else table for table in filled)
+
+
+def _compared(statistics: BenchmarkStatistics) -> tuple[str, ...]:
+    """Measures that are compared with the reference's: the end point, and success."""
+    return ("strict", "success") if statistics.measure == "strict" else ("success",)
 
 
 def without_verdicts(table: Table, caution: str) -> Table:
@@ -176,6 +185,7 @@ def make_cell(
 
 ALL: dict[str, Any] = {}
 SUCCESSES = {"is_success": True}
+STRICT = {"is_strict": True}
 
 
 def interval(
@@ -280,12 +290,17 @@ def findings_table(statistics: BenchmarkStatistics) -> Table:
 def success_table(statistics: BenchmarkStatistics) -> Table:
     """Make the table of success rates."""
     task, limit = statistics.task, statistics.task.success_time_limit
+    is_strict = statistics.measure == "strict"
+    best: Any = (None, highest) if is_strict else (highest, None)
+    rates = [
+        Statistic("Success", "success", percent, "success.rate", SUCCESSES, best[0]),
+        interval("95 % interval", percent, "success", ALL),
+        Statistic("Strict success", "strict_success", percent, "strict.rate", STRICT, best[1]),
+        interval("Its 95 % interval", percent, "strict", ALL, "strict_"),
+    ]
     columns = [
         Statistic("Episodes", "episodes", str, "outcomes.episodes", ALL),
-        Statistic("Success", "success", percent, "success.rate", SUCCESSES, highest),
-        interval("95 % interval", percent, "success", ALL),
-        Statistic("Strict success", "strict_success", percent, "strict.rate", {"is_strict": True}),
-        interval("Its 95 % interval", percent, "strict", ALL, "strict_"),
+        *(rates[2:] + rates[:2] if is_strict else rates),
     ]
     note = "95 % interval: Wilson."
     if statistics.has_many_train_seeds:
@@ -343,16 +358,36 @@ def success_by_training_seed(statistics: BenchmarkStatistics) -> Table:
     return condition_table(name, title, conditions, columns, notes)
 
 
-def success_differences(statistics: BenchmarkStatistics) -> Table:
-    """Make the table of every condition's success against the reference's, on common seeds."""
-    both = {"versus": (statistics.reference,)}
-    differing = {**both, "is_different": True}
-    comparison, difference = "success_difference", "success_difference.difference"
+def success_differences(statistics: BenchmarkStatistics, measure: str = "success") -> Table:
+    """Make the table of every condition's success against the reference's, on common seeds.
+
+    Args:
+        statistics: of the benchmark.
+        measure: ``success`` or ``strict``.
+    """
+    is_strict, both = measure == "strict", {"versus": (statistics.reference,)}
+    differing = {**both, "is_strictly_different" if is_strict else "is_different": True}
+    comparison = f"{measure}_difference"
+    difference = f"{comparison}.difference"
     counts = f"{comparison}.wins {comparison}.losses"
+    people = f"{comparison}.over_people"
+
+    def over_people(number: int, low: float | None, high: float | None) -> str:
+        if low is None or high is None:
+            return "one person" if number == 1 else "nobody"
+        return f"{_ends(points)(low, high)} ({number} people)"
+
     columns = [
         Statistic("Pairs", "pairs", str, f"{difference}.n", both),
         Statistic("Difference", "difference", points, f"{difference}.mean", both),
         interval("95 % interval", points, difference, both),
+        Statistic(
+            "95 % interval over people",
+            "people people_low people_high",
+            over_people,
+            f"{people}.n {people}.low {people}.high",
+            both,
+        ),
         Statistic("Won : lost", "won lost", "{} : {}".format, counts, differing),
         *p_values("McNemar", comparison, differing),
     ]
@@ -362,7 +397,10 @@ def success_differences(statistics: BenchmarkStatistics) -> Table:
         "evaluation seeds that both have.",
         f"95 % interval: bootstrap over common seeds{', training seeds first' if many else ''}; "
         "with no differing episode, Clopper and Pearson's bound for something not seen.",
-        "Won : lost: episodes in which only this condition, and only the reference, succeeded.",
+        "Over people: bootstrap that resamples the people who move, then their episodes; too "
+        "narrow with few people. A computed motion is another person with every seed.",
+        "Won : lost: episodes in which only this condition, and only the reference, succeeded"
+        + (" by the strict condition." if is_strict else "."),
         f"McNemar's exact test, Holm-corrected over the rows; bold below {SIGNIFICANCE:.2f}."
         + (
             " It takes the training runs as given and their episodes as independent: where it and "
@@ -371,9 +409,10 @@ def success_differences(statistics: BenchmarkStatistics) -> Table:
             else ""
         ),
     )
-    title = f"Success against “{statistics.of(statistics.reference).condition.label}”"
+    what = "Strict success" if is_strict else "Success"
+    title = f"{what} against “{statistics.of(statistics.reference).condition.label}”"
     others = [c for c in statistics.conditions if c.condition.name != statistics.reference]
-    return condition_table("success_differences", title, others, columns, notes)
+    return condition_table(f"{measure}_differences", title, others, columns, notes)
 
 
 def success_beside_paper(statistics: BenchmarkStatistics) -> Table:
@@ -471,6 +510,41 @@ def times_beside_paper(statistics: BenchmarkStatistics) -> Table:
     title = f"Completion times beside the paper's {study.time_table or 'results'}"
     conditions = [c for c in statistics.conditions if c.published]
     return condition_table("completion_times_beside_paper", title, conditions, columns, notes)
+
+
+def measures_table(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of the task's columns that are end points; without rows where none has any."""
+    shown = [column for column in statistics.task.columns if column.in_tables]
+
+    def title_of(column: ResultColumn) -> str:
+        return column.name.replace("_", " ").capitalize()
+
+    def measure(column: ResultColumn) -> Statistic:
+        def values(c: ConditionStatistics) -> tuple[float | None, float | None]:
+            found = [row.result.columns.get(column.name) for row in c.rows]
+            numbers = [value for value in found if value is not None]
+            if not numbers:
+                return None, None
+            return float(np.mean(numbers)), float(np.percentile(numbers, 90.0))
+
+        name = column.name
+        title = title_of(column) + (f", {column.unit}" if column.unit else "")
+        return Statistic(title, f"{name} {name}_p90", "{:.2f} ({:.2f})".format, values, ALL)
+
+    columns = [
+        Statistic("Episodes", "episodes", str, "outcomes.episodes", ALL),
+        *map(measure, shown),
+    ]
+    notes = ["Mean over all episodes, and the 90th percentile."]
+    notes += [f"{title_of(column)}: {column.description}." for column in shown]
+    has_any = any(
+        row.result.columns.get(column.name) is not None
+        for c in statistics.conditions
+        for row in c.rows
+        for column in shown
+    )
+    conditions = statistics.conditions if has_any else ()
+    return condition_table("measures", "Further end points", conditions, columns, notes)
 
 
 def failures_table(statistics: BenchmarkStatistics) -> Table:

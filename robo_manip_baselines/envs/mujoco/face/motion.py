@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from robo_manip_baselines.envs.mujoco.face.people import PEOPLE, PeopleSplit, split_runs
 from robo_manip_baselines.observation import MAX_HORIZON
 from robo_manip_baselines.observation.corruption import FRAME_RATE
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -30,6 +31,7 @@ from robo_manip_baselines.runs.npz import (
     read_json_array,
     read_npz,
 )
+from robo_manip_baselines.runs.seeds import stream_generator
 
 DEFAULT_LIBRARY = Path(__file__).with_name("assets") / "face_motion.npz"
 
@@ -123,6 +125,7 @@ class MotionLibrary:
         source: the file it came from.
         predicted: (N, H, 3) m, where a trained predictor said in each frame that the mouth would
             be 1 ... H frames later; None if the library has no predictions.
+        people: whose runs it holds: ``all``, or those of one `part`.
     """
 
     fps: float
@@ -136,6 +139,7 @@ class MotionLibrary:
     metadata: dict[str, Any]
     source: Path
     predicted: NDArray[np.float64] | None = None
+    people: str = "all"
 
     @classmethod
     def load(cls, path: Path | str | None = None) -> MotionLibrary:
@@ -174,7 +178,10 @@ class MotionLibrary:
         digest = hashlib.sha256()
         for name in ("mouth", "orientation", "jaw", "run_start", "run_length"):
             add_array(digest, name, getattr(self, name))
-        names = {"fps": self.fps, "clips": self.run_clip, "subjects": self.run_subject}
+        names: dict[str, Any] = {"fps": self.fps, "clips": self.run_clip}
+        names["subjects"] = self.run_subject
+        if self._stored_split:  # it decides who is drawn, as the motion does
+            names["people"] = [self._stored_split.train, self._stored_split.test]
         digest.update(json.dumps(names).encode())
         return digest.hexdigest()
 
@@ -206,12 +213,52 @@ class MotionLibrary:
                 "motion_library"
             )
 
+    @cached_property
+    def _stored_split(self) -> PeopleSplit | None:
+        return PeopleSplit.of(self.metadata, f"motion library '{self.source}'")
+
+    @cached_property
+    def _parts(self) -> dict[str, MotionLibrary]:
+        # A part holds the runs that it may draw from and no other frame of them, so that no replay,
+        # however fast, leaves it.
+        least = math.ceil(SEGMENT_DURATION * self.fps) + 1
+        runs = (self.run_subject, self.run_clip, self.run_start, self.run_length)
+        stored = self._stored_split
+        try:
+            parts = split_runs(*runs, least=least, stored=stored)
+        except RequestError as error:
+            raise RequestError(f"motion library '{self.source}': {error}") from None
+        return {
+            name: replace(
+                self,
+                run_start=part.start,
+                run_length=part.length,
+                run_clip=tuple(self.run_clip[run] for run in part.run),
+                run_subject=tuple(self.run_subject[run] for run in part.run),
+                people=name,
+            )
+            for name, part in parts.items()
+        }
+
+    def part(self, people: str) -> MotionLibrary:
+        """Return the runs of ``train`` or ``test`` people, see `split_runs`; of ``all``, itself.
+
+        Raises:
+            RequestError: there is no such part, or the library cannot be split.
+        """
+        if require_choice("people", people, PEOPLE) == self.people:
+            return self
+        return self._parts[people]
+
     def starts(self) -> NDArray[np.int64]:
         """Return, (R,), how many frames of each run can start a segment of `SEGMENT_DURATION`."""
         return np.maximum(self.run_length - math.ceil(SEGMENT_DURATION * self.fps), 0)
 
     def draw(self, rng: np.random.Generator, clips: Sequence[str] | None = None) -> MotionSegment:
         """Draw a segment whose start is uniform over all frames that can start one.
+
+        Of a part, a person is drawn first, then one of that person's frames: nobody makes up most
+        of the episodes by having the longest recording.
 
         Args:
             rng: the only source of chance.
@@ -224,11 +271,19 @@ class MotionLibrary:
         if clips is not None:
             wanted = {require_choice("clip", clip, self.run_clip) for clip in clips}
             counts = np.where([clip in wanted for clip in self.run_clip], counts, 0)
-        total = int(counts.sum())
-        if total == 0:
+        if not counts.any():
             where = f" in clips {', '.join(clips)}" if clips else ""
+            where += f" of the people '{self.people}'" if self.people != "all" else ""
             lacking = f"no run of '{self.source.name}' lasts {SEGMENT_DURATION:g} s{where}"
             raise RequestError(f"{lacking}; choose other clips")
+        if self.people != "all":
+            # One number is taken, as for all people: what is drawn later is the same.
+            rng = stream_generator(int(rng.integers(2**32)), f"face motion of {self.people}")
+            present = zip(self.run_subject, counts, strict=True)
+            persons = sorted({subject for subject, count in present if count})
+            person = persons[int(rng.integers(len(persons)))]
+            counts = np.where([subject == person for subject in self.run_subject], counts, 0)
+        total = int(counts.sum())
         index = int(rng.integers(total))
         run = int(np.searchsorted(np.cumsum(counts), index, side="right"))
         return self.segment(run, index - int(counts[:run].sum()))

@@ -170,6 +170,7 @@ class FaceMotion:
         *,
         seed: int | None = None,
         clips: Sequence[str] | None = None,
+        people: str = "all",
     ) -> MotionSegment:
         """Draw the motion of an episode.
 
@@ -179,11 +180,16 @@ class FaceMotion:
             library: recorded motion.
             seed: of the episode, for the named streams of synthetic motions; drawn if None.
             clips: ids of the clips to draw from; all if None.
+            people: whose motion: ``all``, ``train`` or ``test``. Of recordings, see
+                `MotionLibrary.part`; a synthetic motion is another person with every seed, and the
+                seeds of each kind of people have streams of their own.
 
         Raises:
-            RequestError: no such clip, no run is long enough, or the motion leaves the reach of the
-                arm.
+            RequestError: no such clip, no run is long enough, the library cannot be split, or the
+                motion leaves the reach of the arm.
         """
+        if self.recorded is not None:
+            library = library.part(people)
         if self.is_as_recorded:
             return library.draw(rng, clips=clips)
         if seed is None:
@@ -195,7 +201,7 @@ class FaceMotion:
             if self.recorded is not None:
                 again = stream_generator(seed, "face motion recorded", attempt)
                 recording = self.recorded.draw(again if attempt else rng, library, clips)
-            segment = self._combine(recording, seed, attempt)
+            segment = self._combine(recording, seed, attempt, people)
             if np.abs(segment.displacement).max() <= REACH:
                 return segment
         raise RequestError(
@@ -203,7 +209,9 @@ class FaceMotion:
             f"{REACH:g} m from its place on an axis; choose smaller amplitudes or fewer parts"
         )
 
-    def _combine(self, recording: MotionSegment | None, seed: int, attempt: int) -> MotionSegment:
+    def _combine(
+        self, recording: MotionSegment | None, seed: int, attempt: int, people: str
+    ) -> MotionSegment:
         """Sum up the recording and the synthetic parts."""
         computed = [part for part in self.parts if isinstance(part, SyntheticMotion)]
         if recording is not None and not computed:
@@ -212,9 +220,10 @@ class FaceMotion:
         fps = max(rates) if recording is None else max(*rates, recording.fps)
         time = np.arange(_frame_count(fps)) / fps
         displacement, rotation, jaw = np.zeros((len(time), 3)), Rotation.identity(), 0.0
+        whose = "" if people == "all" else f" of {people}"
         for part in self.parts:
             if isinstance(part, SyntheticMotion):
-                rng = stream_generator(seed, f"face motion {part.name}", attempt)
+                rng = stream_generator(seed, f"face motion {part.name}{whose}", attempt)
                 moved = part.sample(rng, time)
             else:
                 assert recording is not None

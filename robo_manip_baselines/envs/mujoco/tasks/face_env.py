@@ -25,6 +25,7 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
     MotionSegment,
 )
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
+from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FRAMES_AHEAD, FaceReplay
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry
 from robo_manip_baselines.observation import (
@@ -72,6 +73,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
         face_motion: start of the motion: ``episode`` or ``after_lift``.
         motion: of the face by name, as `parse_motion` reads it: ``recorded``, ``sway``, ...
+        people: who moves: ``all``, or ``train`` or ``test`` for demonstrations and evaluation with
+            different people, see `MotionLibrary.part`.
         clips: ids of recorded clips to draw from; all if None.
         motion_library: file of ``face_prediction export-motion``; the shipped one if None.
         motion_sha256: digest of the library's motion (`MotionLibrary.sha256`); any if None.
@@ -112,6 +115,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         corruption: Corruption | Mapping[str, Any] | None = None,
         face_motion: str = "episode",
         motion: str | Mapping[str, Any] | Sequence[Any] = "recorded",
+        people: str = "all",
         clips: str | Sequence[str] | None = None,
         motion_library: str | Path | None = None,
         motion_sha256: str | None = None,
@@ -139,12 +143,15 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.renders_images = True
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
         self.motion = parse_motion(motion)
+        self.people = require_choice("people", people, PEOPLE)
         self.clips = _clip_names(clips)
         if not isinstance(motion_library, str | Path | None):
             raise RequestError(f"motion_library {motion_library!r}: must be the path of a file")
         self._pipeline = spec.make_pipeline()
         self.library = MotionLibrary.load(motion_library)
         self.library.require(motion_sha256)
+        if self.motion.recorded is not None:
+            self.library.part(self.people)  # refuses what cannot be split
         if spec.corruption.error == "model":
             if not self.task.predicted_field:
                 raise RequestError(
@@ -164,7 +171,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 "leave them out, or add 'recorded' to the motion"
             )
         for clip in self.clips or ():
-            require_choice("clip", clip, set(self.library.run_clip))
+            require_choice("clip", clip, set(self.library.part(self.people).run_clip))
         self.face = FaceModel.load()
         scene = build_cell()
         add_face(scene)
@@ -266,7 +273,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.motion_start: int | None = 0 if self.face_motion == "episode" else None
         self.face_offset = self.np_random.uniform(-FACE_OFFSET, FACE_OFFSET, 3)
         self.segment: MotionSegment = self.motion.draw(
-            self.np_random, self.library, seed=seed, clips=self.clips
+            self.np_random, self.library, seed=seed, clips=self.clips, people=self.people
         )
         self.replay = FaceReplay.lay_out(
             self.segment,

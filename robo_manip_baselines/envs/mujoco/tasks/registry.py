@@ -84,6 +84,8 @@ class ResultColumn:
         is_optional: whether null is valid.
         in_report: whether the report lists it with each episode.
         unit: SI unit, for the heading in the report.
+        in_tables: whether a table of benchmarks has its mean and 90th percentile.
+        may_be_absent: whether rows of earlier releases lack it, which reads as null.
     """
 
     name: str
@@ -92,6 +94,8 @@ class ResultColumn:
     is_optional: bool = False
     in_report: bool = False
     unit: str = ""
+    in_tables: bool = False
+    may_be_absent: bool = False
 
 
 @dataclass(frozen=True)
@@ -341,6 +345,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "corruption": (dict, type(None)),
     "face_motion": (str,),
     "motion": (str,),
+    "people": (str,),
     "clips": (list, type(None)),
     "motion_library": (str, type(None)),
     "motion_sha256": (str, type(None)),

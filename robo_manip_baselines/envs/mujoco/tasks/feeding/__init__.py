@@ -16,6 +16,9 @@ APPROACH_LIMIT = 6.0
 """s after the lift within which the gripper should be at the mouth (paper, Algorithm 1, line 10).
 ``is_success`` has no such limit; tables count the successes within it."""
 
+FORCE_LIMITS = (1, 10, 30)
+"""N, forces on the face above which time is counted: a touch, a push, and one that hurts."""
+
 ENTRY = TaskEntry(
     name="FeedingEnv",
     env=f"{_PACKAGE}.env:FeedingEnv",
@@ -92,6 +95,28 @@ ENTRY = TaskEntry(
             "N, largest normal force between robot and face",
             in_report=True,
             unit="N",
+            in_tables=True,
+        ),
+        *(
+            ResultColumn(
+                f"force_time_{limit}",
+                "float",
+                f"s, time with more than {limit} N between robot and face",
+                is_optional=True,
+                unit="s",
+                in_tables=True,
+                may_be_absent=True,
+            )
+            for limit in FORCE_LIMITS
+        ),
+        ResultColumn(
+            "dwell",
+            "float",
+            "s, time in which the gripper, the cube held, was within the tolerance of success",
+            is_optional=True,
+            unit="s",
+            in_tables=True,
+            may_be_absent=True,
         ),
     ),
     success="the gripper brought the cube within 0.03, 0.01 and 0.01 m of the mouth",

@@ -59,7 +59,10 @@ class FeedingEnv(FaceEnv):
     |---|---|---|---|
     | ``state`` | (14,), both arms (28,) | always | per arm: 6 joint positions (rad), 6 joint
     velocities (rad/s), gripper position (m) and velocity (m/s) |
-    | ``mouth`` | (4,) | ``obs="current"`` | mouth x, y, z (m) and distance gripper-mouth (m) |
+    | ``mouth`` | (4,) | ``obs="current"``, ``"history"`` | mouth x, y, z (m) and distance
+    gripper-mouth (m) |
+    | ``history`` | (15,) | ``obs="history"`` | for k = 1 ... 5: mouth x, y, z (m) as it was
+    reported k frames of 1/30 s ago; before the start, the first report |
     | ``prediction`` | (5 (H+1),) | ``obs="current_pred"`` | for k = 0 ... H: time (s) and mouth
     x, y, z (m) k frames of 1/30 s ahead; then the H+1 distances gripper-mouth (m) |
     | ``object_position`` | (3,) | ``object_pose=True`` | centre of the cube (m) |
@@ -115,7 +118,7 @@ class FeedingEnv(FaceEnv):
 
     | name | default | meaning |
     |---|---|---|
-    | ``obs`` | ``"baseline"`` | preset: baseline, current, current_pred |
+    | ``obs`` | ``"baseline"`` | preset: baseline, current, current_pred, history |
     | ``horizon`` | 2 | frames that current_pred looks ahead, 1 to 24 |
     | ``cameras`` | all three | any of top, angle, front_close, or one name; ``()`` for none |
     | ``image_size`` | (480, 640) | height and width |
@@ -129,6 +132,7 @@ class FeedingEnv(FaceEnv):
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
+    | ``people`` | ``"all"`` | all, or train or test: different people, drawn before their starts |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
     | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
     None |

@@ -7,7 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE, Phase
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.tasks.feeding import FORCE_LIMITS
+from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
+    MOUTH_TOLERANCE,
+    Phase,
+    is_at_mouth,
+)
 
 Offset = tuple[float, float, float]
 
@@ -22,10 +28,12 @@ of Algorithm 1, line 10, so that letting go a little early does not hide that th
 
 
 class FeedingMetrics:
-    """Closest approach and contact force of one episode; see `EpisodeMetrics`."""
+    """Closest approach, contact force and dwell of one episode; see `EpisodeMetrics`."""
 
     def __init__(self) -> None:
         self._force = 0.0
+        self._steps_above = dict.fromkeys(FORCE_LIMITS, 0)
+        self._steps_inside = 0
         self._distance: float | None = None
         self._offset: Offset | None = None
         self._nearness = np.inf
@@ -34,10 +42,15 @@ class FeedingMetrics:
 
     def update(self, info: Mapping[str, Any]) -> None:
         """Take in the ``info`` of a step."""
-        self._force = max(self._force, float(info["face_force"]))
+        force = float(info["face_force"])
+        self._force = max(self._force, force)
+        for limit in FORCE_LIMITS:
+            self._steps_above[limit] += force > limit
         if info["phase"] not in CARRYING:
             return
-        offset = np.asarray(info["gripper_position"]) - np.asarray(info["mouth_position"])
+        gripper, mouth = np.asarray(info["gripper_position"]), np.asarray(info["mouth_position"])
+        self._steps_inside += is_at_mouth(gripper, mouth)
+        offset = gripper - mouth
         distance = float(np.linalg.norm(offset))
         self._distance = distance if self._distance is None else min(distance, self._distance)
         nearness = float(np.linalg.norm(offset / MOUTH_TOLERANCE))
@@ -57,6 +70,8 @@ class FeedingMetrics:
             "closest_offset": self._offset,
             "cube_offset": self._cube_offset,
             "face_force": self._force,
+            **{f"force_time_{f}": _seconds(steps) for f, steps in self._steps_above.items()},
+            "dwell": _seconds(self._steps_inside),
         }
 
 
@@ -83,6 +98,11 @@ def failure_kind(is_success: bool, was_released: bool, closest_offset: Offset | 
     if abs(up) >= abs(across):
         return "missed_high" if up > 0.0 else "missed_low"
     return "missed_left" if across > 0.0 else "missed_right"
+
+
+def _seconds(steps: int) -> float:
+    """Return the time of control steps, without what floating point adds to it."""
+    return round(steps * CONTROL_PERIOD, 6)
 
 
 def _offset(vector: Any) -> Offset:
