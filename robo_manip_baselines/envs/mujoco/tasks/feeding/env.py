@@ -184,6 +184,11 @@ class FeedingEnv(FaceEnv):
         return from_mouth(self.cube_position, self.mouth_track[0], axes)
 
     @property
+    def face_force(self) -> float:
+        """N, the largest normal force between the robot and the face in the last step."""
+        return self._face_force
+
+    @property
     def object_pose(self) -> NDArray[np.float64]:
         """(7,) position (m) and orientation (wxyz) of the cube, world."""
         return self.data.qpos[self._cube_qpos : self._cube_qpos + 7].copy()
@@ -224,7 +229,7 @@ class FeedingEnv(FaceEnv):
             "phase": progress.phase.name.lower(),
             "time_since_lift": progress.time_since_lift(self.time),
             "completion_time": progress.completion_time,
-            "face_force": self._face_force,
+            "face_force": self.face_force,
         }
 
     def watch_contacts(self) -> None:
