@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from annotated_types import Interval
 from numpy.typing import NDArray
 
-from robo_manip_baselines.benchmark.foresight.forecasters import FORECASTERS, MAX_LEAD, Forecasters
+from robo_manip_baselines.benchmark.foresight.forecasters import FORECASTERS, Forecasters
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.expert.servo import Execution, ServoConfig, first_of
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv

@@ -126,25 +126,24 @@ class Servo:
         """Follow the target, within the limit of speed, and come nearer to the goal."""
         self._step += 1
         goal, aim = self._next(view), self._aim(view)
-        position, distance = self._command.position, self._distance
-        plan = np.empty((self._config.plan_steps, 3))
-        for number in range(len(plan)):
-            distance += min(max(goal - distance, -self._way), self._way)
-            position = self._towards(aim + np.array([distance, 0.0, 0.0]), position)
-            plan[number] = position
-            if number == 0:
-                self._distance = distance
+        way = self._way * np.arange(1, self._config.plan_steps + 1)
+        distance = self._distance + np.clip(goal - self._distance, -way, way)
+        self._distance = float(distance[0])
+        plan = aim + np.multiply.outer(distance, [1.0, 0.0, 0.0])
+        self._keep_to_speed(plan)
         position = self._execution(plan)
         self._command = replace(self._command, position=position, orientation=level_at(position))
         return self._command
 
-    def _towards(
-        self, wanted: NDArray[np.float64], position: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the position, (3,) m, after a control step within the limit of speed."""
-        way = wanted - position
-        longest, length = self._config.speed * CONTROL_PERIOD, math.sqrt(way @ way)
-        return position + way * min(1.0, longest / max(length, longest))
+    def _keep_to_speed(self, plan: NDArray[np.float64]) -> None:
+        """Let wanted positions (K, 3) m be reached within the limit of speed, in place."""
+        position, longest = self._command.position, self._config.speed * CONTROL_PERIOD
+        for row in plan:
+            way = row - position
+            length = math.sqrt(way @ way)
+            row[:] = position = position + way * min(1.0, longest / max(length, longest))
+            if length <= longest and self._way <= longest:
+                break  # it stays with the plan from here on
 
     def _next(self, view: ExpertView) -> float:
         """Return the distance to go to."""
