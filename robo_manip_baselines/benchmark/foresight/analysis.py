@@ -195,8 +195,9 @@ class ForesightStatistics:
         if not common:
             return None
         grids = [np.array([[float(c[s].is_success_strict) for s in common]]) for c in cells]
+        ours, theirs = grids
         rng = stream_generator(0, "foresight gain", setting.delay)
-        return paired_success(*grids, rng, self.resamples)
+        return paired_success(ours, theirs, rng, self.resamples)
 
     def _law(self, motion: str, settings: Sequence[Setting]) -> LatencyLaw:
         has_ensemble = [setting.execution == "ensemble" for setting in settings]

@@ -69,7 +69,7 @@ def _cpu() -> tuple[Cell, ...]:
         *forecaster_cells("sway", (4,), fitted),
         *lead_cells("recorded", (0, 4, 8)),
         *lead_cells("recorded", (4,), "ensemble"),
-        *forecaster_cells("recorded", (4, 8), (*fitted, "residual")),
+        *forecaster_cells("recorded", (0, 4, 8), (*fitted, "residual")),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -199,7 +200,7 @@ def _panels(
 ) -> tuple[list[str], Any]:
     """Return the motions, and axes (rows, motions)."""
     motions = list(dict.fromkeys(found.cell.motion for found in statistics.cells))
-    figure.set_size_inches(max(size[0] * len(motions), 4.0), size[1] * len(rows) + 0.8)
+    figure.set_size_inches(max(size[0] * len(motions), 6.4), size[1] * len(rows) + 0.8)
     return motions, figure.subplots(len(rows), len(motions), squeeze=False, sharey="row")
 
 
@@ -228,7 +229,7 @@ def draw_surface(figure: Any, statistics: ForesightStatistics) -> None:
     executions = _executions(statistics)
     motions, panels = _panels(figure, statistics, (4.2, 2.6), executions)
     best = {found.setting: found for found in statistics.best_leads}
-    scale = ScalarMappable(Normalize(0.0, 100.0), "cividis")
+    scale: Any = ScalarMappable(Normalize(0.0, 100.0), "cividis")
     for execution, line in zip(executions, panels, strict=True):
         for motion, axes in zip(motions, line, strict=True):
             cells = _of(statistics, motion, execution)
@@ -256,7 +257,7 @@ def draw_surface(figure: Any, statistics: ForesightStatistics) -> None:
 def _mark_best(axes: Any, best: BestLead | None, row: int) -> None:
     if best is None:
         return
-    axes.plot([best.expected] * 2, [row - 0.44, row + 0.44], color=INK, lw=1.0, ls=":")
+    axes.plot(best.expected, row - 0.32, "^", color="#ffffff", mec=INK, ms=8, zorder=5)
     if best.lead.mean is not None:
         axes.plot(best.lead.mean, row + 0.32, "v", color=RED, mec="#ffffff", ms=9, zorder=5)
 
@@ -265,7 +266,8 @@ def draw_tracking(figure: Any, statistics: ForesightStatistics) -> None:
     """Draw the tracking error against the lead, counted from the expected one."""
     executions = _executions(statistics)
     motions, panels = _panels(figure, statistics, (3.6, 2.6), executions)
-    colors = dict(zip((0, 4, 8, 12), (SKY, BLUE, GREEN, ORANGE), strict=True))
+    delays = sorted({found.cell.delay for found in statistics.cells})
+    colors = dict(zip(delays, cycle((SKY, BLUE, GREEN, ORANGE)), strict=False))
     for execution, line in zip(executions, panels, strict=True):
         for motion, axes in zip(motions, line, strict=True):
             cells = _of(statistics, motion, execution)
@@ -277,7 +279,7 @@ def draw_tracking(figure: Any, statistics: ForesightStatistics) -> None:
                     if found.cell.delay == delay and found.tracking_error is not None
                 ]
                 x, y = zip(*points, strict=True) if points else ((), ())
-                style: Any = {"color": colors.get(delay, GREY), "label": f"delay {delay}"}
+                style: Any = {"color": colors[delay], "label": f"delay {delay}"}
                 axes.plot(x, y, "o-", ms=5, **style)
             axes.axvline(0.0, color=GREY, lw=1.0, ls=":")
             axes.set_title(f"{motion}, {EXECUTION_TITLES[execution]}", fontsize=10)
@@ -319,7 +321,7 @@ def draw_forecasters(figure: Any, statistics: ForesightStatistics) -> None:
     for axes in panels[0]:
         drawn, labels = axes.get_legend_handles_labels()
         handles.update(zip(labels, drawn, strict=True))
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=9)
+    figure.legend(handles.values(), handles, loc="outside upper center", ncols=4, fontsize=9)
     figure.supxlabel("delay, frames of 1/30 s", fontsize=10)
     figure.supylabel("strict success, %", fontsize=10)
 
@@ -327,8 +329,8 @@ def draw_forecasters(figure: Any, statistics: ForesightStatistics) -> None:
 FIGURE_LIST = (
     StudyFigure(
         "surface",
-        "Strict success, %, over delay and lead, with the true future. Red: the best lead, by the "
-        "tracking error. Dotted: the lead that latency explains.",
+        "Strict success, %, over delay and lead, with the true future. Red, from above: the "
+        "best lead, by the tracking error. White, from below: the lead that latency explains.",
         draw_surface,
     ),
     StudyFigure(
