@@ -44,7 +44,7 @@ NAME = "foresight"
 FIRST_SEED = 0
 """of the episodes."""
 
-EPISODE_SECONDS = 0.3
+EPISODE_SECONDS = 0.25
 """of one core for an episode of a cell, measured where the presets were made."""
 
 logger = logging.getLogger(__name__)
@@ -55,7 +55,8 @@ class ForesightOptions:
     """Options of the study.
 
     Attributes:
-        preset: Size: cpu (half an hour on two cores) or smoke (a minute).
+        preset: Size: cpu (half an hour on two cores), full (75 minutes, more motions, delays and
+            forecasters) or smoke (half a minute).
         num_episodes: Episodes of each cell, seeds from 0; as in the preset if not given.
         motion_library: File of recorded face motion; the one that ships with the package if not
             given.

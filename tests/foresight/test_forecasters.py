@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from robo_manip_baselines.benchmark.foresight.forecasters import (
     FORECASTERS,
@@ -31,7 +32,7 @@ START, VELOCITY = np.array([0.0, 0.5, 0.35]), np.array([0.01, -0.04, 0.02])
 HORIZONS = [0.0, 1.0, 2.5, 8.0, MAX_LEAD]
 
 
-def line(time: np.ndarray | float) -> np.ndarray:
+def line(time: ArrayLike) -> np.ndarray:
     return START + np.multiply.outer(np.asarray(time), VELOCITY)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from robo_manip_baselines.benchmark.foresight.episodes import Cell
 from robo_manip_baselines.benchmark.foresight.grid import PRESETS, ForesightPreset, lead_cells
-from robo_manip_baselines.benchmark.foresight.study import possible_cells, requests
+from robo_manip_baselines.benchmark.foresight.study import possible_cells, read_study, requests
 from robo_manip_baselines.commands.benchmark import main
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -77,8 +77,6 @@ def test_a_changed_input_is_refused(tmp_path: Path) -> None:
 
 def test_a_damaged_row_is_named(tmp_path: Path) -> None:
     (tmp_path / "foresight.jsonl").write_text('{"version": 1}\n')
-    from robo_manip_baselines.benchmark.foresight.study import read_study
-
     with pytest.raises(RequestError, match=r"line 1: .*remove that line"):
         read_study(tmp_path)
 
@@ -102,7 +100,7 @@ def test_its_name_comes_first() -> None:
 
 
 def test_unknown_presets_are_refused() -> None:
-    with pytest.raises(RequestError, match="unknown preset 'paper'; valid: cpu, smoke, tiny"):
+    with pytest.raises(RequestError, match="unknown preset 'paper'; valid: cpu, full, smoke, tiny"):
         main(["foresight", "--preset", "paper"])
 
 

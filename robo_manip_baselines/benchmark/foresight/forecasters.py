@@ -172,7 +172,8 @@ def fit_autoregression(paths: Floats) -> LinearForecaster:
     """Fit an autoregression to paths (E, T, 3) m, of the order with the least error."""
     fitted, held_out = _split(paths)
     sums = moments(np.diff(fitted, axis=1), max(ORDERS))
-    made = [autoregression(solve(sums, order, 3)) for order in ORDERS]
+    # Rounded, so that the number of threads of BLAS, which sums in another order, changes nothing.
+    made = [autoregression(solve(sums, order, 3).round(6)) for order in ORDERS]
     return min(made, key=lambda forecaster: forecaster.error(held_out, FIT_HORIZON))
 
 

@@ -58,19 +58,35 @@ def forecaster_cells(
             yield Cell(motion, delay, execution, name, expected_lead(delay, execution))
 
 
+FITTED = ("constant_velocity", "autoregression", "kalman", "shuffled")
+"""Forecasters for any motion; `residual` has forecasts of recorded motion alone."""
+
+
 def _cpu() -> tuple[Cell, ...]:
-    fitted = ("constant_velocity", "autoregression", "kalman", "shuffled")
     return (
         *lead_cells("dyskinetic", (0, 4, 8, 12)),
-        *lead_cells("dyskinetic", (0, 4, 8), "ensemble"),
-        *forecaster_cells("dyskinetic", (0, 4, 8), fitted),
-        *lead_cells("sway", (0, 4, 8)),
-        *lead_cells("sway", (4,), "ensemble"),
-        *forecaster_cells("sway", (4,), fitted),
+        *lead_cells("dyskinetic", (0, 4), "ensemble"),
+        *forecaster_cells("dyskinetic", (4, 8), FITTED),
+        *lead_cells("sway", (4, 8)),
+        *forecaster_cells("sway", (4,), FITTED[:2]),
         *lead_cells("recorded", (0, 4, 8)),
         *lead_cells("recorded", (4,), "ensemble"),
-        *forecaster_cells("recorded", (0, 4, 8), (*fitted, "residual")),
+        *forecaster_cells("recorded", (4,), (*FITTED, "residual")),
     )
+
+
+def _full() -> tuple[Cell, ...]:
+    moving = ("dyskinetic", "sway", "recorded", "recorded:speed=3")
+    cells: list[Cell] = []
+    for motion in (*moving, "still", "tremor"):
+        is_control = motion not in moving
+        cells += lead_cells(motion, (8,) if is_control else (0, 4, 8, 12))
+        if not is_control:
+            forecasters = (*FITTED, "residual") if motion == "recorded" else FITTED
+            cells += lead_cells(motion, (0, 4, 8, 12), "ensemble")
+            cells += forecaster_cells(motion, (0, 4, 8), forecasters)
+            cells += forecaster_cells(motion, (4,), ("autoregression",), "ensemble")
+    return tuple(cells)
 
 
 def _smoke() -> tuple[Cell, ...]:
@@ -81,5 +97,9 @@ def _smoke() -> tuple[Cell, ...]:
     )
 
 
-PRESETS = {"cpu": ForesightPreset(_cpu(), 200), "smoke": ForesightPreset(_smoke(), 3)}
+PRESETS = {
+    "cpu": ForesightPreset(_cpu(), 200),
+    "full": ForesightPreset(_full(), 200),
+    "smoke": ForesightPreset(_smoke(), 3),
+}
 """Sizes by name."""

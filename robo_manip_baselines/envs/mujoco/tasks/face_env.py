@@ -230,7 +230,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self._actuators = np.array([model.actuator(servo).id for servo in servos])
         self._gripper_site = model.site("right/gripper").id
         self._mouth_site = model.site("mouth").id
-        self._is_face = model.geom_contype == FACE  # (ngeom,)
+        self._face_geoms = frozenset(np.flatnonzero(model.geom_contype == FACE).tolist())
         self._mocap = {
             model.body(body).name: int(model.body_mocapid[body])
             for body in range(model.nbody)
@@ -276,6 +276,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             timestep=self.model.opt.timestep,
             substeps=self.substeps,
         )
+        # (P, bodies, 3) and (P, bodies, 4), beside one another: a step reads one row of each.
+        self._moved = [self._mocap[body] for body in self.replay.bodies]
+        self._paths = [np.stack(p, axis=1) for p in zip(*self.replay.bodies.values(), strict=True)]
         self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
         self.reset_task(self.np_random)
@@ -458,13 +461,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
         For `watch_contacts`: a control step has several physics steps.
         """
-        force, is_face = 0.0, self._is_face[self.data.contact.geom]
-        if not is_face.any():  # as a rule
-            return force
-        wrench = np.zeros(6)
-        for contact in np.flatnonzero(is_face.any(axis=1)):
-            mujoco.mj_contactForce(self.model, self.data, contact, wrench)
-            force = max(force, float(wrench[0]))
+        force, wrench = 0.0, None
+        for contact, pair in enumerate(self.data.contact.geom.tolist()):
+            if not self._face_geoms.isdisjoint(pair):
+                wrench = np.zeros(6) if wrench is None else wrench
+                mujoco.mj_contactForce(self.model, self.data, contact, wrench)
+                force = max(force, float(wrench[0]))
         return force
 
     @property
@@ -561,9 +563,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         moving = 0 if self.motion_start is None else substep
         last = (len(self.replay.jaw) - 1) * self.substeps
         row = min(self._motion_step() * self.substeps + moving, last)
-        for body, (position, orientation) in self.replay.bodies.items():
-            self.data.mocap_pos[self._mocap[body]] = position[row]
-            self.data.mocap_quat[self._mocap[body]] = orientation[row]
+        positions, orientations = self._paths
+        self.data.mocap_pos[self._moved] = positions[row]
+        self.data.mocap_quat[self._moved] = orientations[row]
 
     def _set_arm(self, arm: str, joints: Sequence[float], finger: float) -> None:
         for joint, angle in zip(ARM_JOINTS, joints, strict=True):

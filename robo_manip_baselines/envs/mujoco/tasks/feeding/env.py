@@ -155,8 +155,8 @@ class FeedingEnv(FaceEnv):
         self._cube_body = model.body("cube").id
         self._cube_geom = model.geom("cube").id
         links = [model.body(f"right/{side}_finger_link").id for side in ("left", "right")]
-        # Bit 0 for a geom of the left finger, bit 1 for one of the right.
-        self._finger_bits = (model.geom_bodyid == np.array(links)[:, None]).T @ [1, 2]  # (ngeom,)
+        # For each geom: bit 0 where it is of the left finger, bit 1 of the right.
+        self._finger_bits = ((model.geom_bodyid == np.array(links)[:, None]).T @ [1, 2]).tolist()
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Add the red cube."""
@@ -237,7 +237,7 @@ class FeedingEnv(FaceEnv):
         """Record which fingers touch the cube, and how hard the robot touches the face."""
         for first, second in self.data.contact.geom.tolist():
             if self._cube_geom in (first, second):
-                self._fingers_on_cube |= int(self._finger_bits[first] | self._finger_bits[second])
+                self._fingers_on_cube |= self._finger_bits[first] | self._finger_bits[second]
         self._face_force = max(self._face_force, self.max_face_force())
 
     def _clear_contacts(self) -> None:
