@@ -229,12 +229,11 @@ def draw_surface(figure: Any, statistics: ForesightStatistics) -> None:
     executions = _executions(statistics)
     motions, panels = _panels(figure, statistics, (4.2, 2.6), executions)
     best = {found.setting: found for found in statistics.best_leads}
+    delays = sorted({found.cell.delay for found in statistics.cells})
     scale: Any = ScalarMappable(Normalize(0.0, 100.0), "cividis")
     for execution, line in zip(executions, panels, strict=True):
         for motion, axes in zip(motions, line, strict=True):
-            cells = _of(statistics, motion, execution)
-            delays = sorted({found.cell.delay for found in cells})
-            for found in cells:
+            for found in _of(statistics, motion, execution):
                 delay, lead = delays.index(found.cell.delay), found.cell.lead
                 percent = 100.0 * (found.strict.rate or 0.0)
                 place: Any = ((lead - 1.4, delay - 0.44), 2.8, 0.88)
@@ -244,7 +243,7 @@ def draw_surface(figure: Any, statistics: ForesightStatistics) -> None:
             for delay in delays:
                 _mark_best(axes, best.get(Setting(motion, delay, execution)), delays.index(delay))
             axes.set_xlim(-2.0, MAX_LEAD + 2.0)
-            axes.set_ylim(-0.6, max(len(delays), 1) - 0.4)
+            axes.set_ylim(-0.6, len(delays) - 0.4)
             axes.set_xticks(range(0, MAX_LEAD + 1, 4))
             axes.set_yticks(range(len(delays)), map(str, delays))
             axes.set_title(f"{motion}, {EXECUTION_TITLES[execution]}", fontsize=10)
@@ -264,6 +263,8 @@ def _mark_best(axes: Any, best: BestLead | None, row: int) -> None:
 
 def draw_tracking(figure: Any, statistics: ForesightStatistics) -> None:
     """Draw the tracking error against the lead, counted from the expected one."""
+    from matplotlib.ticker import MaxNLocator
+
     executions = _executions(statistics)
     motions, panels = _panels(figure, statistics, (3.6, 2.6), executions)
     delays = sorted({found.cell.delay for found in statistics.cells})
@@ -283,10 +284,12 @@ def draw_tracking(figure: Any, statistics: ForesightStatistics) -> None:
                 axes.plot(x, y, "o-", ms=5, **style)
             axes.axvline(0.0, color=GREY, lw=1.0, ls=":")
             axes.set_title(f"{motion}, {EXECUTION_TITLES[execution]}", fontsize=10)
-            axes.set_ylim(bottom=0.0)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.grid(axis="y")
             if cells:
-                axes.legend(fontsize=8, loc="upper left")
+                axes.legend(fontsize=8)
+    for axes in panels[:, 0]:  # they share their limits with those of their row
+        axes.set_ylim(bottom=0.0)
     figure.supxlabel("lead minus the expected lead, frames of 1/30 s", fontsize=10)
     figure.supylabel("tracking error, mm", fontsize=10)
 
@@ -305,7 +308,7 @@ def draw_forecasters(figure: Any, statistics: ForesightStatistics) -> None:
             ]
         truth = _of(statistics, motion, "direct")
         series["persistence"] = [found for found in truth if found.cell.lead == 0]
-        shift = {name: 0.14 * (k - len(series) / 2.0) for k, name in enumerate(FORECASTERS)}
+        shift = {name: 0.1 * (k - len(series) / 2.0) for k, name in enumerate(FORECASTERS)}
         for name in (name for name in FORECASTERS if series[name]):
             x = np.array([found.cell.delay for found in series[name]]) + shift[name]
             rates = [found.strict for found in series[name]]

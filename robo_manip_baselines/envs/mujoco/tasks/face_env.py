@@ -276,9 +276,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             timestep=self.model.opt.timestep,
             substeps=self.substeps,
         )
-        # (P, bodies, 3) and (P, bodies, 4), beside one another: a step reads one row of each.
-        self._moved = [self._mocap[body] for body in self.replay.bodies]
-        self._paths = [np.stack(p, axis=1) for p in zip(*self.replay.bodies.values(), strict=True)]
         self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
         self.reset_task(self.np_random)
@@ -563,9 +560,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         moving = 0 if self.motion_start is None else substep
         last = (len(self.replay.jaw) - 1) * self.substeps
         row = min(self._motion_step() * self.substeps + moving, last)
-        positions, orientations = self._paths
-        self.data.mocap_pos[self._moved] = positions[row]
-        self.data.mocap_quat[self._moved] = orientations[row]
+        for body, (position, orientation) in self.replay.bodies.items():
+            self.data.mocap_pos[self._mocap[body]] = position[row]
+            self.data.mocap_quat[self._mocap[body]] = orientation[row]
 
     def _set_arm(self, arm: str, joints: Sequence[float], finger: float) -> None:
         for joint, angle in zip(ARM_JOINTS, joints, strict=True):
