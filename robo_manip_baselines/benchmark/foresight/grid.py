@@ -66,7 +66,8 @@ def _cpu() -> tuple[Cell, ...]:
     return (
         *lead_cells("dyskinetic", (0, 4, 8, 12)),
         *lead_cells("dyskinetic", (0, 4), "ensemble"),
-        *forecaster_cells("dyskinetic", (4, 8), FITTED),
+        *forecaster_cells("dyskinetic", (4,), FITTED),
+        *forecaster_cells("dyskinetic", (8,), FITTED[:2]),
         *lead_cells("sway", (4, 8)),
         *forecaster_cells("sway", (4,), FITTED[:2]),
         *lead_cells("recorded", (0, 4, 8)),
