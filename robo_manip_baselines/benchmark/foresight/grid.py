@@ -72,7 +72,8 @@ def _cpu() -> tuple[Cell, ...]:
         *forecaster_cells("sway", (4,), FITTED[:2]),
         *lead_cells("recorded", (0, 4, 8)),
         *lead_cells("recorded", (4,), "ensemble"),
-        *forecaster_cells("recorded", (4,), (*FITTED, "residual")),
+        *forecaster_cells("recorded", (4,), FITTED),
+        *forecaster_cells("recorded", (0, 4), ("residual",)),
     )
 
 
