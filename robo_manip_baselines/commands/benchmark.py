@@ -40,6 +40,7 @@ from robo_manip_baselines.benchmark.scheduler import (
     run_items,
 )
 from robo_manip_baselines.benchmark.work_item import ITEMS, ArtifactStore, WorkItem
+from robo_manip_baselines.commands import foresight
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.runs.command import EXIT_FAILED, parse
@@ -66,7 +67,8 @@ class BenchmarkOptions:
     """Options of a benchmark.
 
     Attributes:
-        benchmark: Name of the benchmark: feeding, delay.
+        benchmark: Name of the benchmark: feeding, delay; or foresight, a study without training
+            that has options of its own (foresight --help).
         preset: Size: cpu (without images), paper (three cameras, a GPU) or smoke (three minutes).
         conditions: Names of conditions, with spaces or commas between them; those of the preset if
             not given.
@@ -118,6 +120,8 @@ class BenchmarkOptions:
     dry_run: bool = False
 
     def __post_init__(self) -> None:
+        if self.benchmark == foresight.NAME:
+            raise RequestError(f"benchmark '{foresight.NAME}': its name comes first, then options")
         if self.conditions_file is None:
             shipped = [path.stem for path in CONDITIONS.glob("*.yaml")]
             require_choice("benchmark", self.benchmark, shipped)
@@ -344,5 +348,7 @@ def _executor(options: BenchmarkOptions, store: ArtifactStore) -> Executor:
 
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Benchmark.py``."""
+    if args and args[0] == foresight.NAME:
+        return foresight.main(args[1:])
     prepare_pytorch()
     return benchmark(parse_options(args))

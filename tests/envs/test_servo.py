@@ -11,6 +11,7 @@ from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_OPEN
 from robo_manip_baselines.envs.mujoco.expert.phases import DOWN, Command, ExpertView
 from robo_manip_baselines.envs.mujoco.expert.servo import (
     ARM_LAG,
+    Forecast,
     Hold,
     Insert,
     ServoConfig,
@@ -66,6 +67,49 @@ def test_commands_keep_to_the_limit_of_speed() -> None:
     assert ways.max() == pytest.approx(0.2 * STEP)
 
 
+def plans_of(config: ServoConfig, forecast: Forecast, steps: int) -> tuple[list, list]:
+    """Run a phase whose plans are executed at their first step; return plans and commands."""
+    plans: list[np.ndarray] = []
+
+    def execution(plan: np.ndarray) -> np.ndarray:
+        plans.append(plan.copy())
+        return plan[0]
+
+    phase = Hold(forecast, config, goal=0.1, rate=0.3, duration=9.0, execution=execution)
+    return plans, follow(phase, steps)
+
+
+def test_plans_take_the_target_to_stay() -> None:
+    config = ServoConfig(lead=0, plan_steps=30)
+    plans, _ = plans_of(config, drifting, 60)
+    last, wanted = plans[-1], MOUTH + np.array([0.1, 0.1 * 59 * STEP, 0.0])
+    np.testing.assert_allclose(last, np.tile(wanted, (30, 1)), atol=1e-9)
+
+
+def test_plans_come_nearer_at_the_rate_and_keep_to_the_speed() -> None:
+    """From 0.2 m to 0.1 m at 0.3 m/s, and to a target 40 mm aside at 0.5 m/s, at the first step."""
+
+    def aside(seen: float, ahead: float) -> np.ndarray:
+        return MOUTH + np.array([0.0, 0.04 * (seen >= 0.0), 0.0])
+
+    phase_plans, commands = plans_of(ServoConfig(lead=0, plan_steps=30), aside, 1)
+    (plan,) = phase_plans
+    np.testing.assert_array_equal(commands[1], plan[0])
+    ways = np.linalg.norm(np.diff([commands[0], *plan], axis=0), axis=1)
+    assert ways.max() <= 0.5 * STEP + 1e-12
+    assert ways[0] == pytest.approx(0.5 * STEP)
+    expected = np.maximum(0.2 - 0.3 * STEP * np.arange(1, 31), 0.1)
+    np.testing.assert_allclose(plan[10:, 0] - MOUTH[0], expected[10:], atol=1e-9)
+    np.testing.assert_allclose(plan[10:, 1] - MOUTH[1], 0.04, atol=1e-9)
+
+
+def test_the_first_step_of_a_plan_is_the_plan_of_one_step() -> None:
+    """Whatever the number of steps, as long as the first one is executed."""
+    _, one = plans_of(ServoConfig(lead=2, speed=0.12), drifting, 80)
+    _, many = plans_of(ServoConfig(lead=2, speed=0.12, plan_steps=30), drifting, 80)
+    np.testing.assert_array_equal(one, many)
+
+
 def test_it_goes_in_at_its_rate_and_lets_go_after_the_dwell() -> None:
     config = ServoConfig(lead=0, dwell=0.1)
     phase = Insert(still, config, goal=0.028, rate=0.1, waiting=0.08)
@@ -112,6 +156,11 @@ def test_it_judges_by_the_present_as_far_as_it_knows_it(
     asked.clear()
     phase.step(ExpertView(MOUTH[None], time=1.0))
     np.testing.assert_allclose(asked, [1.0 + believed / 30, 1.0 + (lead - delay) / 30])
+
+
+def test_plans_have_a_step_or_more() -> None:
+    with pytest.raises(RequestError, match="plan_steps 0: must be 1 or more"):
+        ServoConfig(plan_steps=0)
 
 
 @pytest.mark.parametrize("name", ["lead", "delay", "speed", "dwell", "limit", "gate"])

@@ -9,18 +9,20 @@ from face_prediction.forecast import LandmarkSequences, mouth_centre
 from face_prediction.forecast.autoregression import (
     LandmarkAutoregression,
     MouthAutoregression,
-    forecast,
     held_out_errors,
     least_error,
-    moments,
     principal_shapes,
-    solve,
-    spectral_radius,
-    stabilised,
 )
 from face_prediction.forecast.extrapolation import ConstantVelocity, LineFit, Persistence
 from face_prediction.forecast.interface import subject_folds
 from face_prediction.tracking.geometry import LIPS
+from robo_manip_baselines.runs.autoregression import (
+    forecast,
+    moments,
+    solve,
+    spectral_radius,
+    stabilised,
+)
 from robo_manip_baselines.runs.errors import RequestError
 
 FACE = np.random.default_rng(5).uniform(0.2, 0.8, (468, 2))

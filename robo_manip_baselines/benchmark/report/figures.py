@@ -52,7 +52,7 @@ MANY_POINTS = 3000
 HORIZON_LABEL = "horizon, frames of 1/30 s"
 
 _INK_OF = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
-_STYLE: Any = {
+STYLE: Any = {
     **dict.fromkeys(_INK_OF, INK),
     "axes.facecolor": "none",
     "axes.spines.right": False,
@@ -65,6 +65,7 @@ _STYLE: Any = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # a "$" in a condition's title is one
 }
+"""Matplotlib's settings for the figures of reports."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def render_figure(
             f"figures need matplotlib ({error}); run: {install_command('train')}"
         ) from None
     stream = io.StringIO()
-    with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):
+    with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
         figure = Figure(layout="constrained", facecolor="none")
         FigureCanvasSVG(figure)
         caption, summary = draw(figure, statistics)

@@ -266,10 +266,21 @@ class PhasedExpert:
         """Begin with the first phase; call it after the environment's reset."""
         self._joints = np.array(HOME_QPOS)
         home = self._kinematics.forward(self._joints)
-        self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
-        self._phases = self.phases(self._command)
-        self._phase = self._phases.pop(0)
+        self._home = self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
+        self.skip_to(0)
+
+    def skip_to(self, number: int) -> None:
+        """Go on with the phase of a number, counted from 0, from the last command."""
+        phases = self.phases(self._home)
+        self._count, self._phases = len(phases), phases[number + 1 :]
+        self._phase = phases[number]
         self._phase.start(self.view(), self._command)
+
+    @property
+    def phases_done(self) -> int:
+        """Number of phases that are done."""
+        is_done = self._phase.is_done(self.view())
+        return self._count - len(self._phases) - (0 if is_done else 1)
 
     def act(self) -> NDArray[np.float32]:
         """Return the next action, (7,): joint targets in rad and the finger in m."""

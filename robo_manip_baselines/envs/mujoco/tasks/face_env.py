@@ -237,6 +237,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self._actuators = np.array([model.actuator(servo).id for servo in servos])
         self._gripper_site = model.site("right/gripper").id
         self._mouth_site = model.site("mouth").id
+        self._face_geoms = frozenset(np.flatnonzero(model.geom_contype == FACE).tolist())
         self._mocap = {
             model.body(body).name: int(model.body_mocapid[body])
             for body in range(model.nbody)
@@ -336,7 +337,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         Raises:
             ValueError: it has the wrong shape, or is not finite.
         """
-        names, form = self.action_names, f"must be ({len(self._actuators)},) finite numbers"
+        form = f"must be ({len(self._actuators)},) finite numbers"
         try:
             values = np.asarray(action)
         except (TypeError, ValueError):  # rows of different lengths, say
@@ -344,10 +345,10 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         if values.dtype.kind not in "fiu":
             raise ValueError(f"action {' '.join(repr(action).split())}: {form}")
         values = values.astype(np.float64)
-        if values.shape != (len(names),):
+        if values.shape != self._actuators.shape:
             raise ValueError(f"action of shape {values.shape}: {form}")
         if len(bad := np.flatnonzero(~np.isfinite(values))):
-            place = f"{values[bad[0]]} in element {bad[0]}, {names[bad[0]]}"
+            place = f"{values[bad[0]]} in element {bad[0]}, {self.action_names[bad[0]]}"
             raise ValueError(f"action with {place}: {form}")
         return values
 
@@ -464,11 +465,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
         For `watch_contacts`: a control step has several physics steps.
         """
-        force, wrench = 0.0, np.zeros(6)
-        is_face = self.model.geom_contype[self.data.contact.geom] == FACE
-        for contact in np.flatnonzero(is_face.any(axis=1)):
-            mujoco.mj_contactForce(self.model, self.data, contact, wrench)
-            force = max(force, float(wrench[0]))
+        force, wrench = 0.0, None
+        for contact, pair in enumerate(self.data.contact.geom.tolist()):
+            if not self._face_geoms.isdisjoint(pair):
+                wrench = np.zeros(6) if wrench is None else wrench
+                mujoco.mj_contactForce(self.model, self.data, contact, wrench)
+                force = max(force, float(wrench[0]))
         return force
 
     @property

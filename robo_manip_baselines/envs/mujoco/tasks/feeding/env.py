@@ -159,7 +159,8 @@ class FeedingEnv(FaceEnv):
         self._cube_body = model.body("cube").id
         self._cube_geom = model.geom("cube").id
         links = [model.body(f"right/{side}_finger_link").id for side in ("left", "right")]
-        self._is_finger = model.geom_bodyid == np.array(links)[:, None]  # (2, ngeom)
+        # For each geom: bit 0 where it is of the left finger, bit 1 of the right.
+        self._finger_bits = ((model.geom_bodyid == np.array(links)[:, None]).T @ [1, 2]).tolist()
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Add the red cube."""
@@ -186,6 +187,11 @@ class FeedingEnv(FaceEnv):
         """(3,) m: centre of the cube from the mouth, see ``from_mouth``."""
         axes = self.data.site_xmat[self._mouth_site].reshape(3, 3)
         return from_mouth(self.cube_position, self.mouth_track[0], axes)
+
+    @property
+    def face_force(self) -> float:
+        """N, the largest normal force between the robot and the face in the last step."""
+        return self._face_force
 
     @property
     def object_pose(self) -> NDArray[np.float64]:
@@ -228,18 +234,18 @@ class FeedingEnv(FaceEnv):
             "phase": progress.phase.name.lower(),
             "time_since_lift": progress.time_since_lift(self.time),
             "completion_time": progress.completion_time,
-            "face_force": self._face_force,
+            "face_force": self.face_force,
         }
 
     def watch_contacts(self) -> None:
         """Record which fingers touch the cube, and how hard the robot touches the face."""
-        pairs = self.data.contact.geom
-        on_cube = (pairs == self._cube_geom).any(axis=1)
-        self._fingers_on_cube |= self._is_finger[:, pairs[on_cube]].any(axis=(1, 2))
+        for first, second in self.data.contact.geom.tolist():
+            if self._cube_geom in (first, second):
+                self._fingers_on_cube |= self._finger_bits[first] | self._finger_bits[second]
         self._face_force = max(self._face_force, self.max_face_force())
 
     def _clear_contacts(self) -> None:
-        self._fingers_on_cube = np.zeros(2, dtype=bool)
+        self._fingers_on_cube = 0
         self._face_force = 0.0
 
     def _measure(self) -> StepMeasurements:
@@ -247,8 +253,8 @@ class FeedingEnv(FaceEnv):
         half_width, half_height = self.mouth_opening.tolist()
         return StepMeasurements(
             time=self.time,
-            is_held=bool(self._fingers_on_cube.all()),
-            is_touched=bool(self._fingers_on_cube.any()),
+            is_held=self._fingers_on_cube == 0b11,
+            is_touched=self._fingers_on_cube != 0,
             cube_height=float(self.cube_position[2]),
             is_at_mouth=is_at_mouth(gripper, mouth),
             is_inside_mouth=is_inside_mouth(self.cube_offset, half_width, half_height),

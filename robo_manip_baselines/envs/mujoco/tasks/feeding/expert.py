@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,14 @@ from robo_manip_baselines.envs.mujoco.expert.phases import (
     Reach,
     level_at,
 )
-from robo_manip_baselines.envs.mujoco.expert.servo import Forecast, Hold, Insert, ServoConfig
+from robo_manip_baselines.envs.mujoco.expert.servo import (
+    Execution,
+    Forecast,
+    Hold,
+    Insert,
+    ServoConfig,
+    first_of,
+)
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import is_at_mouth
 from robo_manip_baselines.observation import FRAME_PERIOD
@@ -143,6 +152,11 @@ class FeedingExpert(PhasedExpert):
         ]
 
 
+LIFTED, BROUGHT, INSERTED, WITHDRAWN = 4, 5, 6, 8
+"""Phases of a `FeedingServo` that are done when it has lifted the cube, brought it before the
+mouth, ended the insertion, and withdrawn."""
+
+
 class FeedingServo(FeedingExpert):
     """Visual servo that feeds: it fetches the cube as Algorithm 1 does and then tracks the mouth.
 
@@ -150,6 +164,7 @@ class FeedingServo(FeedingExpert):
         env: the environment, unwrapped.
         config: lead, delay and limits of the servo.
         forecast: source of the mouth; the truth if None.
+        execution: of its plans, from the insertion on.
     """
 
     def __init__(
@@ -157,21 +172,37 @@ class FeedingServo(FeedingExpert):
         env: FeedingEnv,
         config: ServoConfig | None = None,
         forecast: Forecast | None = None,
+        execution: Execution = first_of,
     ) -> None:
         super().__init__(env)
         self._config = ServoConfig() if config is None else config
         self._forecast = self._truth if forecast is None else forecast
+        self._execution = execution
+
+    def branch(
+        self,
+        number: int,
+        config: ServoConfig,
+        forecast: Forecast,
+        execution: Execution = first_of,
+    ) -> FeedingServo:
+        """Return a servo with other settings that goes on from here with the phase ``number``."""
+        other = copy.copy(self)
+        other._config, other._forecast, other._execution = config, forecast, execution
+        other.skip_to(number)
+        return other
 
     def phases(self, home: Command) -> list[ExpertPhase]:
         """Return the phases of one episode, in order."""
         forecast, config = self._forecast, self._config
         inside, out = float(INSERTION[0]), float(WITHDRAWAL[0])
-        letting_go = {"duration": 0.3, "finger": FINGER_OPEN}
+        coming: Any = {"goal": inside, "rate": INSERTION_SPEED, "execution": self._execution}
+        going: Any = {"goal": out, "rate": WITHDRAWAL_SPEED, "execution": self._execution}
         return [
             *fetch(lambda view: self._seen(view) + STANDOFF),
-            Insert(forecast, config, goal=inside, rate=INSERTION_SPEED, waiting=WAITING),
-            Hold(forecast, config, goal=inside, rate=INSERTION_SPEED, **letting_go),
-            Hold(forecast, config, goal=out, rate=WITHDRAWAL_SPEED, duration=0.5),
+            Insert(forecast, config, **coming, waiting=WAITING),
+            Hold(forecast, config, **coming, duration=0.3, finger=FINGER_OPEN),
+            Hold(forecast, config, **going, duration=0.5),
             Reach(lambda view, last: home),
         ]
 

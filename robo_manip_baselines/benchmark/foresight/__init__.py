@@ -1,0 +1,1 @@
+"""Value of foresight to a scripted visual servo, without any learning."""
