@@ -138,7 +138,8 @@ class ConditionConfig:
         corruption = self.spec.corruption
         if self.prediction != "truth":  # forecasts are recorded as a predictor's output is
             corruption = replace(corruption, error="model")
-        return replace(preset, obs=self.spec.obs, horizon=self.spec.horizon, corruption=corruption)
+        given = {name: getattr(self.spec, name) for name in ("obs", "horizon", "relative")}
+        return replace(preset, **given, corruption=corruption)
 
 
 _NOT_OF_A_CONDITION = (

@@ -107,6 +107,8 @@ class ObservationSpec:
             demonstrations' images.
         object_pose: Show the positions of the task's objects.
         arms: Arms in state and action: right or both.
+        relative: Show mouth and objects relative to the gripper, and the mouth in past and future
+            frames relative to the present one.
         corruption: Corruption of the target between simulator and policy.
 
     Raises:
@@ -120,6 +122,7 @@ class ObservationSpec:
     render_size: tyro.conf.Suppress[ImageSize | None] = None
     object_pose: bool = False
     arms: str = "right"
+    relative: bool = False
     corruption: Corruption = field(default_factory=Corruption)
 
     def __post_init__(self) -> None:
@@ -178,6 +181,8 @@ class ObservationSpec:
             del values["render_size"]
         arms, corruption = values.pop("arms"), values.pop("corruption")
         values |= {"error": self.corruption.error, "arms": arms}
+        if not self.relative:
+            del values["relative"]
         return values | {"corruption": corruption} if self.corruption else values
 
     @classmethod
@@ -201,7 +206,8 @@ class ObservationSpec:
         """Name of the condition, such as ``current_pred_h2_uniform``."""
         horizon = f"_h{self.horizon}" if self.obs == "current_pred" else ""
         corruption = f"_{self.corruption.label}" if self.corruption else ""
-        return f"{self.obs}{horizon}{corruption}"
+        relative = "_relative" if self.relative else ""
+        return f"{self.obs}{horizon}{relative}{corruption}"
 
     @property
     def drawn_size(self) -> tuple[int, int]:
@@ -277,19 +283,25 @@ class ObservationSpec:
         gripper = np.stack([state.gripper_position, state.gripper_velocity], axis=-1)
         arms = np.concatenate([state.joint_position, state.joint_velocity, gripper], axis=-1)
         parts = [arms.reshape(*arms.shape[:-2], -1)]
+        gripper_position = state.end_effector_position[..., None, :]
         if self.frames:
             position = observed.position[..., : self.frames, :]
-            distance = np.linalg.norm(position - state.end_effector_position[..., None, :], axis=-1)
+            distance = np.linalg.norm(position - gripper_position, axis=-1)
+            past = observed.past
+            if self.relative:
+                now = position[..., :1, :]
+                position = np.concatenate([now - gripper_position, position[..., 1:, :] - now], -2)
+                past = None if past is None else past - now
             if self.obs != "current_pred":
                 parts += [position[..., 0, :], distance]
-                if observed.past is not None:
-                    parts.append(observed.past.reshape(*observed.past.shape[:-2], -1))
+                if past is not None:
+                    parts.append(past.reshape(*past.shape[:-2], -1))
             else:
                 time = observed.time[..., None] + np.arange(self.frames) * FRAME_PERIOD
                 timed = np.concatenate([time[..., None], position], axis=-1)
                 parts += [timed.reshape(*timed.shape[:-2], -1), distance]
         if self.object_pose:
-            objects = state.object_position
+            objects = state.object_position - (gripper_position if self.relative else 0.0)
             parts.append(objects.reshape(*objects.shape[:-2], -1))
         return np.concatenate([part.astype(np.float32) for part in parts], axis=-1)
 
@@ -301,13 +313,23 @@ class ObservationSpec:
         ends = np.cumsum([len(part) for part in components.values()])
         return dict(zip(components, np.split(vector, ends[:-1], axis=-1), strict=True))
 
-    def target_positions(self, vector: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Return the target positions, (F, 3) m, in a packed vector (S,); F is 0 for baseline."""
+    def target_positions(
+        self, vector: NDArray[np.float32], gripper_position: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the target positions, (F, 3) m, world, in a packed vector (S,).
+
+        F is 0 for baseline. The gripper's position, (3,) m, is the one at that time.
+        """
         start = len(_state_names(self.arm_names))
         if self.obs in ("current", "history"):
-            return vector[None, start : start + 3].astype(np.float64)
-        timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
-        return timed[:, 1:].astype(np.float64)
+            positions = vector[None, start : start + 3].astype(np.float64)
+        else:
+            timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
+            positions = timed[:, 1:].astype(np.float64)
+        if self.relative and len(positions):
+            positions[0] += gripper_position
+            positions[1:] += positions[0]
+        return positions
 
 
 def _camera_names(given: object) -> tuple[str, ...]:

@@ -33,20 +33,28 @@ def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
     shown = {"state": state}
     gripper = true.end_effector_position
 
+    now = true.target_position[0]
+
     def distance(k: int) -> float:
         return float(sum((true.target_position[k] - gripper) ** 2) ** 0.5)
 
+    def position(k: int) -> list[float]:
+        if not spec.relative:
+            return [*true.target_position[k]]
+        return [*(true.target_position[k] - (now if k else gripper))]
+
     if spec.obs in ("current", "history"):
-        shown["mouth"] = [*true.target_position[0], distance(0)]
+        shown["mouth"] = [*position(0), distance(0)]
     if spec.obs == "history":  # a single step: nothing but the present was ever reported
-        shown["history"] = 5 * [*true.target_position[0]]
+        shown["history"] = 15 * [0.0] if spec.relative else 5 * [*now]
     if spec.obs == "current_pred":
         numbers: list[float] = []
         for k in range(spec.horizon + 1):
-            numbers += [float(true.time) + k / 30, *true.target_position[k]]
+            numbers += [float(true.time) + k / 30, *position(k)]
         shown["prediction"] = numbers + [distance(k) for k in range(spec.horizon + 1)]
     if spec.object_pose:
-        shown["object_position"] = [*true.object_position[0]]
+        origin = gripper if spec.relative else np.zeros(3)
+        shown["object_position"] = [*(true.object_position[0] - origin)]
     return shown
 
 
@@ -57,6 +65,7 @@ specs = st.builds(
     cameras=st.just(()),
     object_pose=st.booleans(),
     arms=st.sampled_from(["right", "both"]),
+    relative=st.booleans(),
 )
 
 

@@ -57,16 +57,18 @@ def test_names_say_seed_and_outcome() -> None:
     assert names == ["seed_000007_never_grasped.mp4", "seed_000012_success.mp4"]
 
 
+@pytest.mark.parametrize("relative", [False, True])
 @pytest.mark.parametrize("obs", ["baseline", "current", "current_pred"])
 def test_without_a_corruption_the_observed_target_is_the_true_one(
-    env_config: EnvConfig, obs: str
+    env_config: EnvConfig, obs: str, relative: bool
 ) -> None:
-    config = replace(env_config, spec=replace(env_config.spec, obs=obs))
+    config = replace(env_config, spec=replace(env_config.spec, obs=obs, relative=relative))
     with config.make() as env:
         env.reset(seed=3)
         world = world_of(env)
         truth = world.target_track()[: config.spec.frames]
-    observed = config.spec.target_positions(world.vector)
+        gripper = world.gripper_position
+    observed = config.spec.target_positions(world.vector, gripper)
     assert observed.shape == (config.spec.frames, 3)
     np.testing.assert_allclose(observed, truth, atol=1e-6)  # float32
 

@@ -67,7 +67,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     ``completion_time`` (s, None before success) and ``phase`` (one of ``phase_names``).
 
     Args:
-        obs, horizon, cameras, image_size, object_pose, arms: see `ObservationSpec`.
+        obs, horizon, cameras, image_size, object_pose, arms, relative: see `ObservationSpec`.
         render_size: height and width at which cameras are drawn, before `fit_image` makes the
             images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
@@ -111,6 +111,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         image_size: tuple[int, int] = (480, 640),
         render_size: tuple[int, int] | None = None,
         object_pose: bool = False,
+        relative: bool = False,
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
         face_motion: str = "episode",
@@ -134,6 +135,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             image_size=image_size,
             render_size=render_size,
             object_pose=object_pose,
+            relative=relative,
             arms=arms,
             corruption=_make_corruption(corruption),
         )

@@ -341,6 +341,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "image_size": (list,),
     "render_size": (list, type(None)),
     "object_pose": (bool,),
+    "relative": (bool,),
     "arms": (str,),
     "corruption": (dict, type(None)),
     "face_motion": (str,),
