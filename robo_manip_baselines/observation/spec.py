@@ -107,8 +107,7 @@ class ObservationSpec:
             demonstrations' images.
         object_pose: Show the positions of the task's objects.
         arms: Arms in state and action: right or both.
-        relative: Show mouth and objects relative to the gripper, and the mouth in past and future
-            frames relative to the present one.
+        relative: Show the mouth in past and future frames relative to the present one.
         corruption: Corruption of the target between simulator and policy.
 
     Raises:
@@ -138,6 +137,9 @@ class ObservationSpec:
         if not isinstance(self.object_pose, bool | np.bool_):
             raise RequestError(f"object_pose {self.object_pose!r}: must be True or False")
         object.__setattr__(self, "object_pose", bool(self.object_pose))
+        # The other presets show the present frame alone.
+        has_frames = self.obs in ("current_pred", "history")
+        object.__setattr__(self, "relative", bool(self.relative) and has_frames)
         object.__setattr__(self, "image_size", _checked_size("image size", self.image_size))
         self._check_render_size()
         if not isinstance(self.corruption, Corruption):
@@ -283,14 +285,13 @@ class ObservationSpec:
         gripper = np.stack([state.gripper_position, state.gripper_velocity], axis=-1)
         arms = np.concatenate([state.joint_position, state.joint_velocity, gripper], axis=-1)
         parts = [arms.reshape(*arms.shape[:-2], -1)]
-        gripper_position = state.end_effector_position[..., None, :]
         if self.frames:
             position = observed.position[..., : self.frames, :]
-            distance = np.linalg.norm(position - gripper_position, axis=-1)
+            distance = np.linalg.norm(position - state.end_effector_position[..., None, :], axis=-1)
             past = observed.past
             if self.relative:
                 now = position[..., :1, :]
-                position = np.concatenate([now - gripper_position, position[..., 1:, :] - now], -2)
+                position = np.concatenate([now, position[..., 1:, :] - now], axis=-2)
                 past = None if past is None else past - now
             if self.obs != "current_pred":
                 parts += [position[..., 0, :], distance]
@@ -301,7 +302,7 @@ class ObservationSpec:
                 timed = np.concatenate([time[..., None], position], axis=-1)
                 parts += [timed.reshape(*timed.shape[:-2], -1), distance]
         if self.object_pose:
-            objects = state.object_position - (gripper_position if self.relative else 0.0)
+            objects = state.object_position
             parts.append(objects.reshape(*objects.shape[:-2], -1))
         return np.concatenate([part.astype(np.float32) for part in parts], axis=-1)
 
@@ -313,22 +314,15 @@ class ObservationSpec:
         ends = np.cumsum([len(part) for part in components.values()])
         return dict(zip(components, np.split(vector, ends[:-1], axis=-1), strict=True))
 
-    def target_positions(
-        self, vector: NDArray[np.float32], gripper_position: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the target positions, (F, 3) m, world, in a packed vector (S,).
-
-        F is 0 for baseline. The gripper's position, (3,) m, is the one at that time.
-        """
+    def target_positions(self, vector: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the target positions, (F, 3) m, in a packed vector (S,); F is 0 for baseline."""
         start = len(_state_names(self.arm_names))
         if self.obs in ("current", "history"):
-            positions = vector[None, start : start + 3].astype(np.float64)
-        else:
-            timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
-            positions = timed[:, 1:].astype(np.float64)
-        if self.relative and len(positions):
-            positions[0] += gripper_position
-            positions[1:] += positions[0]
+            return vector[None, start : start + 3].astype(np.float64)
+        timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
+        positions = timed[:, 1:].astype(np.float64)
+        if self.relative:
+            positions[1:] += positions[:1]
         return positions
 
 

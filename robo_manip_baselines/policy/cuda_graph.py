@@ -29,7 +29,7 @@ class Replay(Generic[Result]):
         device: CUDA device.
 
     Attributes:
-        is_recorded: whether calls are replays.
+        is_recorded: true once the work is recorded and calls replay it.
     """
 
     def __init__(self, compute: Callable[[], Result], device: torch.device) -> None:
@@ -41,7 +41,7 @@ class Replay(Generic[Result]):
 
     @property
     def is_recorded(self) -> bool:
-        """Whether calls are replays."""
+        """True once the work is recorded and calls replay it."""
         return self._graph is not None
 
     def __call__(self) -> Result:

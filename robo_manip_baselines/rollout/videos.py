@@ -370,7 +370,7 @@ def video_frames(
                 caption = f"{title}: {info['phase']}, {step * CONTROL_PERIOD:.1f} s"
                 if step == last:
                     caption += f"  {result.failure.replace('_', ' ') or 'SUCCESS'}"
-                observed = config.spec.target_positions(vector, world.gripper_position)
+                observed = config.spec.target_positions(vector)
                 frame = _draw(world, np.array(track), observed, caption)
                 yield from [frame] * (1 + HOLD_FRAMES if step == last else 1)
             _, _, _, _, info = env.step(action)

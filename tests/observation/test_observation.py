@@ -39,9 +39,7 @@ def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
         return float(sum((true.target_position[k] - gripper) ** 2) ** 0.5)
 
     def position(k: int) -> list[float]:
-        if not spec.relative:
-            return [*true.target_position[k]]
-        return [*(true.target_position[k] - (now if k else gripper))]
+        return [*(true.target_position[k] - (now if spec.relative and k else 0.0))]
 
     if spec.obs in ("current", "history"):
         shown["mouth"] = [*position(0), distance(0)]
@@ -53,8 +51,7 @@ def obvious(spec: ObservationSpec, true: State) -> dict[str, list[float]]:
             numbers += [float(true.time) + k / 30, *position(k)]
         shown["prediction"] = numbers + [distance(k) for k in range(spec.horizon + 1)]
     if spec.object_pose:
-        origin = gripper if spec.relative else np.zeros(3)
-        shown["object_position"] = [*(true.object_position[0] - origin)]
+        shown["object_position"] = [*true.object_position[0]]
     return shown
 
 

@@ -67,8 +67,7 @@ def test_without_a_corruption_the_observed_target_is_the_true_one(
         env.reset(seed=3)
         world = world_of(env)
         truth = world.target_track()[: config.spec.frames]
-        gripper = world.gripper_position
-    observed = config.spec.target_positions(world.vector, gripper)
+    observed = config.spec.target_positions(world.vector)
     assert observed.shape == (config.spec.frames, 3)
     np.testing.assert_allclose(observed, truth, atol=1e-6)  # float32
 
