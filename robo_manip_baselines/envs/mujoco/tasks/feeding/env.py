@@ -125,6 +125,7 @@ class FeedingEnv(FaceEnv):
     | ``render_size`` | None | height and width at which cameras are drawn, before the images are
     cropped about their centre and shrunk to ``image_size``; the same if None |
     | ``object_pose`` | False | show the cube's position |
+    | ``relative`` | False | show past and future frames of the mouth relative to the present one |
     | ``corruption`` | None | what stands between true and shown mouth: an
     ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
     3}``; None shows the truth |
