@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.benchmark.conditions import CONDITIONS
-from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.work_item import ArtifactStore
 from robo_manip_baselines.commands import benchmark as command
 from robo_manip_baselines.commands.benchmark import (

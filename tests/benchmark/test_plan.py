@@ -20,7 +20,6 @@ from robo_manip_baselines.benchmark.conditions import (
     DrawnPeople,
     read_conditions,
 )
-from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.plan import PRESETS, BenchmarkPreset, Plan, make_plan
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
