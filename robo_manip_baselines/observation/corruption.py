@@ -40,8 +40,11 @@ MEASURED_ERRORS = tuple(DRAWN_ERRORS)
 ERRORS = ("none", *MEASURED_ERRORS, "model")
 """Errors of the forecast; ``model`` is the recorded output of a trained predictor."""
 
-FORECASTERS = ("persistence", "constant_velocity", "autoregression", "kalman", "shuffled")
-"""Forecasters that know the past of the target alone; ``shuffled``, a control, none of its motion."""
+FORECASTERS = (
+    *("persistence", "constant_velocity", "autoregression", "direct_autoregression", "kalman"),
+    "shuffled",
+)
+"""Forecasters that know the past of the target alone; ``shuffled`` is a control."""
 
 PREDICTIONS = ("truth", *FORECASTERS)
 """Future of the target before errors: the true one, or that of a forecaster."""
@@ -76,7 +79,7 @@ class Corruption:
             errors replayed) or model (recorded output of a trained predictor).
         prediction: Forecast of the target: truth (its true future), or that of a forecaster, made
             at each control step of the target until then: persistence, constant_velocity,
-            autoregression, kalman or shuffled (motion of another episode).
+            autoregression, direct_autoregression, kalman or shuffled (motion of another episode).
         error_stats: File of error statistics; the shipped one if None.
         stats_sha256: SHA-256 of that file, where a policy was trained with it; any if None.
         delay: Frames of 1/30 s from the camera to the policy.

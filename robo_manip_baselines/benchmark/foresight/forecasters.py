@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 FORECASTERS = (
     *("truth", "persistence", "constant_velocity", "autoregression", "kalman", "residual"),
-    "shuffled",
+    *("shuffled", "direct_autoregression"),
 )
 """Names of the forecasters."""
 

@@ -1,11 +1,10 @@
 """Causal forecasters of the mouth, and a control that knows nothing of it.
 
-They know the mouth in video frames of 1/30 s up to the newest one seen, without noise. Persistence,
-constant velocity, autoregression and the Kalman filter are linear: a matrix of weights for each
-horizon, applied to the frames seen. The last two are fitted, for each motion, to episodes that
-neither demonstrations nor evaluations use; of recorded motion these are other starts in the same
-recordings, and with people apart, in those of the people of demonstrations. ``shuffled`` moves as
-in another episode.
+They know the mouth in video frames of 1/30 s up to the newest one seen, without noise. All but
+``shuffled``, which moves as in another episode, are linear: a matrix of weights for each horizon,
+applied to the frames seen. Autoregressions and the Kalman filter are fitted, for each motion, to
+episodes that neither demonstrations nor evaluations use; of recorded motion these are other starts
+in the same recordings, and with people apart, in those of the people of demonstrations.
 
 Legend: H frames ahead at most, N frames seen, E episodes, T frames of a path or control steps of an
 episode, K frames from now to the longest one known, D state.
@@ -31,7 +30,7 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
 from robo_manip_baselines.envs.mujoco.face.motions import FaceMotion, parse_motion
 from robo_manip_baselines.envs.mujoco.face.replay import FRAMES_AHEAD
 from robo_manip_baselines.observation import FORECASTERS, FRAME_PERIOD, MAX_HORIZON
-from robo_manip_baselines.runs.autoregression import forecast, moments, solve
+from robo_manip_baselines.runs.autoregression import RIDGE, forecast, moments, solve
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.seeds import derive_seed
 
@@ -136,10 +135,19 @@ def autoregression(coefficients: Floats) -> LinearForecaster:
     # The response to a displacement of 1 m, k frames ago, along each axis.
     unit = np.eye(3 * order).reshape(order, 3, order, 3)[:, :, ::-1]
     moved = forecast(coefficients, unit.reshape(3 * order, order, 3), MAX_LEAD).cumsum(axis=1)
-    response = np.zeros((MAX_LEAD + 1, order + 1, 3, 3))
-    response[1:, :order] = moved.reshape(order, 3, MAX_LEAD, 3).transpose(2, 0, 3, 1)
-    weights = response.copy()  # a displacement is the difference of two frames
-    weights[:, 1:] -= response[:, :-1]
+    return _of_displacements(moved.reshape(order, 3, MAX_LEAD, 3).transpose(2, 0, 3, 1))
+
+
+def _of_displacements(response: Floats) -> LinearForecaster:
+    """Return the forecaster that is linear in displacements, the differences of two frames.
+
+    Args:
+        response: (H, P, 3, 3), how far the mouth moves until h frames ahead, h from 1 on, for a
+            displacement k frames ago.
+    """
+    weights = np.zeros((response.shape[0] + 1, response.shape[1] + 1, 3, 3))
+    weights[1:, :-1] = response
+    weights[1:, 1:] -= response
     weights[:, 0] += np.eye(3)
     return LinearForecaster(weights)
 
@@ -188,6 +196,27 @@ def fit_autoregression(paths: Floats) -> LinearForecaster:
     return min(made, key=lambda forecaster: forecaster.error(held_out, FIT_HORIZON))
 
 
+def fit_direct_autoregression(tracks: Floats, order: int = max(ORDERS)) -> LinearForecaster:
+    """Fit a regression of its own for each horizon on displacements, of tracks (E, T, K, 3) m.
+
+    An autoregression that is iterated, as by `fit_autoregression`, enlarges its errors with every
+    frame, and what it knows of frames does not hold between them. This one is fitted to the
+    displacements that are seen at control steps, and minimises the error at each horizon.
+    """
+    size = 3 * order
+    cross, target = np.zeros((size, size)), np.zeros((size, 3 * MAX_LEAD))
+    for track in tracks:
+        seen = frames_seen(track, order + 1)
+        moved = (seen[:, :-1] - seen[:, 1:]).reshape(-1, size)
+        ahead = (track[:, 1:] - track[:, :1]).reshape(-1, 3 * MAX_LEAD)
+        cross += moved.T @ moved
+        target += moved.T @ ahead
+    ridge = RIDGE * max(np.trace(cross) / size, np.finfo(float).tiny)
+    # Rounded for the same reason as above.
+    solved = np.linalg.solve(cross + ridge * np.eye(size), target).round(6)
+    return _of_displacements(solved.reshape(order, 3, MAX_LEAD, 3).transpose(2, 0, 3, 1))
+
+
 def fit_kalman(paths: Floats) -> LinearForecaster:
     """Choose the Kalman filter with the least error on paths (E, T, 3) m."""
     _, held_out = _split(paths)
@@ -198,15 +227,6 @@ def fit_kalman(paths: Floats) -> LinearForecaster:
 def _split(paths: Floats) -> tuple[Floats, Floats]:
     count = 3 * len(paths) // 4
     return paths[:count], paths[count:]
-
-
-LINEAR: Mapping[str, Callable[[Callable[[], Floats]], LinearForecaster]] = {
-    "persistence": lambda _: persistence(),
-    "constant_velocity": lambda _: constant_velocity(),
-    "autoregression": lambda draw: fit_autoregression(draw()),
-    "kalman": lambda draw: fit_kalman(draw()),
-}
-"""Name of a linear forecaster -> what makes it, given what draws paths (E, T, 3) m to fit to."""
 
 
 @dataclass(frozen=True)
@@ -264,9 +284,11 @@ class MotionForecasters:
 
     def paths(self) -> Floats:
         """Draw the displacement of the mouth in episodes to fit to, (E, T, 3) m, in frames."""
-        time = np.arange(round(SEGMENT_DURATION / FRAME_PERIOD)) * FRAME_PERIOD
-        drawn = [self._draw(derive_seed(0, "fit", n)) for n in range(FIT_EPISODES)]
-        return np.stack([segment.displacement_at(time) for segment in drawn])
+        return self._fit_to(np.arange(round(SEGMENT_DURATION / FRAME_PERIOD)) * FRAME_PERIOD)
+
+    def tracks(self) -> Floats:
+        """Draw the same at control steps, (E, T, K, 3) m: now and in the frames to come."""
+        return self._fit_to(_step_times(round(SEGMENT_DURATION / CONTROL_PERIOD)) + FRAMES_AHEAD)
 
     def another_episode(self, seed: int) -> MotionSegment:
         """Draw the motion of another episode than the one of ``seed``, for ``shuffled``."""
@@ -288,7 +310,7 @@ class MotionForecasters:
             RequestError: there is no such forecaster.
         """
         if require_choice("forecaster", name, FORECASTERS) == "shuffled":
-            time = np.arange(len(track))[:, None] * CONTROL_PERIOD + FRAMES_AHEAD
+            time = _step_times(len(track)) + FRAMES_AHEAD
             other = self.another_episode(seed).displacement_at(time)
             made = track[:, :1] + other[:, 1:] - other[:, :1]
         else:
@@ -299,14 +321,33 @@ class MotionForecasters:
         # The face stands still after its motion, and so does the forecast.
         return made[np.minimum(np.arange(len(track)), round(SEGMENT_DURATION / CONTROL_PERIOD))]
 
+    def _fit_to(self, time: Floats) -> Floats:
+        drawn = [self._draw(derive_seed(0, "fit", n)) for n in range(FIT_EPISODES)]
+        return np.stack([segment.displacement_at(time) for segment in drawn])
+
     def _draw(self, seed: int) -> MotionSegment:
         rng = np.random.default_rng(seed)
         return self.motion.draw(rng, self.library, seed=seed, people=self.people)
 
 
+LINEAR: Mapping[str, Callable[[MotionForecasters], LinearForecaster]] = {
+    "persistence": lambda _: persistence(),
+    "constant_velocity": lambda _: constant_velocity(),
+    "autoregression": lambda made: fit_autoregression(made.paths()),
+    "direct_autoregression": lambda made: fit_direct_autoregression(made.tracks()),
+    "kalman": lambda made: fit_kalman(made.paths()),
+}
+"""Name of a linear forecaster -> what makes it for a motion."""
+
+
 @cache
 def _fitted(name: str, forecasters: MotionForecasters) -> LinearForecaster:
-    return LINEAR[name](forecasters.paths)
+    return LINEAR[name](forecasters)
+
+
+def _step_times(count: int) -> Floats:
+    """Return (T, 1) s, the times of control steps."""
+    return np.arange(count)[:, None] * CONTROL_PERIOD
 
 
 def frames_seen(track: Floats, count: int) -> Floats:
