@@ -77,9 +77,6 @@ class Corruption:
     Attributes:
         error: Error of the forecast: none, uniform (the paper's), gaussian, empirical (measured
             errors replayed) or model (recorded output of a trained predictor).
-        prediction: Forecast of the target: truth (its true future), or that of a forecaster, made
-            at each control step of the target until then: persistence, constant_velocity,
-            autoregression, direct_autoregression, kalman or shuffled (motion of another episode).
         error_stats: File of error statistics; the shipped one if None.
         stats_sha256: SHA-256 of that file, where a policy was trained with it; any if None.
         delay: Frames of 1/30 s from the camera to the policy.
@@ -87,13 +84,15 @@ class Corruption:
         face_dropout_length: Mean length of a loss, frames.
         detector_rate: Detections per second, at most 30; one at every control step if None.
         seed: Seed of errors and losses, beside that of the episode.
+        prediction: Forecast of the target: truth (its true future), or that of a forecaster, made
+            at each control step of the target until then: persistence, constant_velocity,
+            autoregression, direct_autoregression, kalman or shuffled (motion of another episode).
 
     Raises:
         RequestError: a value is not valid.
     """
 
     error: str = "none"
-    prediction: str = "truth"
     error_stats: str | None = None
     stats_sha256: tyro.conf.Suppress[str | None] = None
     delay: Annotated[int, Interval(ge=0, le=MAX_DELAY)] = 0
@@ -101,6 +100,7 @@ class Corruption:
     face_dropout_length: Annotated[float, Interval(ge=1.0, le=1e6)] = DROPOUT_LENGTH
     detector_rate: Annotated[float, Interval(gt=0.0, le=FRAME_RATE)] | None = None
     seed: Annotated[Seed, tyro.conf.arg(name="corruption_seed")] = 0
+    prediction: str = "truth"
 
     def __post_init__(self) -> None:
         require_choice("error model", self.error, ERRORS)

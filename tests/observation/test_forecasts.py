@@ -131,7 +131,7 @@ def test_another_future_changes_no_forecast(name: str, motion: str) -> None:
 def state_of(track: np.ndarray, forecast: np.ndarray | None) -> State:
     steps = len(track)
     return State(
-        time=np.arange(steps) * 0.02,
+        time=np.asarray(np.arange(steps) * 0.02, np.float64),
         joint_position=np.zeros((steps, 1, 6)),
         joint_velocity=np.zeros((steps, 1, 6)),
         gripper_position=np.zeros((steps, 1)),

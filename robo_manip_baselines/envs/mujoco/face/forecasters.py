@@ -321,7 +321,7 @@ class MotionForecasters:
         # The face stands still after its motion, and so does the forecast.
         return made[np.minimum(np.arange(len(track)), round(SEGMENT_DURATION / CONTROL_PERIOD))]
 
-    def _fit_to(self, time: Floats) -> Floats:
+    def _fit_to(self, time: ArrayLike) -> Floats:
         drawn = [self._draw(derive_seed(0, "fit", n)) for n in range(FIT_EPISODES)]
         return np.stack([segment.displacement_at(time) for segment in drawn])
 
@@ -345,7 +345,7 @@ def _fitted(name: str, forecasters: MotionForecasters) -> LinearForecaster:
     return LINEAR[name](forecasters)
 
 
-def _step_times(count: int) -> Floats:
+def _step_times(count: int) -> NDArray[np.floating[Any]]:
     """Return (T, 1) s, the times of control steps."""
     return np.arange(count)[:, None] * CONTROL_PERIOD
 
