@@ -16,12 +16,11 @@ from typing import Annotated, Any
 
 from annotated_types import Len
 
-from robo_manip_baselines.benchmark.forecasts import FORECASTS
 from robo_manip_baselines.benchmark.statistics.outcomes import END_POINTS
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
-from robo_manip_baselines.observation import Corruption, ObservationSpec
+from robo_manip_baselines.observation import PREDICTIONS, Corruption, ObservationSpec
 from robo_manip_baselines.policy.registry import policy_entry
 from robo_manip_baselines.runs.documents import convert, load_yaml, shortened
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_printable
@@ -31,6 +30,9 @@ CONDITIONS = Path(str(files("robo_manip_baselines.benchmark") / "conditions"))
 
 PUBLISHED = "published"
 """In place of a list of names: the conditions whose results the task's paper reports."""
+
+MODEL = "model"
+"""Prediction of a trained predictor, as the motion library holds it: the error of that name."""
 
 _DEFAULT_SPEC = ObservationSpec("current_pred", cameras=())
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -47,8 +49,6 @@ class ConditionConfig:
         policy: for example ``Act``.
         spec: observations in training and evaluation; their cameras, objects and arms are those of
             the benchmark's preset.
-        prediction: future of the target in observations: ``truth``, or a forecast in its place, see
-            `forecasts`.
         expert: of the demonstrations; the task's default if empty.
         motion: of the face in demonstrations and evaluation, as text that `parse_motion` reads; in
             YAML a mapping or a list, too.
@@ -61,7 +61,6 @@ class ConditionConfig:
     name: str
     policy: str = "Act"
     spec: ObservationSpec = _DEFAULT_SPEC
-    prediction: str = "truth"
     expert: str = ""
     motion: str = "recorded"
     title: str = ""
@@ -74,23 +73,12 @@ class ConditionConfig:
             )
         require_printable("title", self.title)
         policy_entry(self.policy)
-        require_choice("prediction", self.prediction, ("truth", *FORECASTS))
         motion = parse_motion(self.motion)
         object.__setattr__(self, "motion", str(motion))
-        spec = self.spec
-        if not motion.is_as_recorded and (
-            self.prediction != "truth" or spec.corruption.error == "model"
-        ):
+        if not motion.is_as_recorded and self.spec.corruption.error == "model":
             raise RequestError(
-                f"motion '{motion}': forecasts in place of the truth, and the error model, are of "
-                "recorded motion; leave one of them out"
-            )
-        if self.prediction != "truth" and (
-            spec.obs != "current_pred" or spec.corruption.error != "none"
-        ):
-            raise RequestError(
-                f"prediction '{self.prediction}' goes with obs current_pred and without an error; "
-                "leave the other out"
+                f"motion '{motion}': the trained predictor has seen recorded motion alone; choose "
+                f"another prediction, of {', '.join(PREDICTIONS)}, or leave the motion out"
             )
 
     @classmethod
@@ -106,10 +94,17 @@ class ConditionConfig:
             if name == "motion":
                 value = str(parse_motion(value))
             given[owner][name] = value
+        corruption = given[Corruption]
+        if corruption.get("prediction") == MODEL:
+            if "error" in corruption:
+                raise RequestError(f"prediction '{MODEL}' goes without an error; leave it out")
+            corruption |= {"prediction": "truth", "error": MODEL}
+        elif "prediction" in corruption:
+            require_choice("prediction", corruption["prediction"], (*PREDICTIONS, MODEL))
         if "name" not in given[cls]:
             raise RequestError("the condition has no name; add 'name: ...'")
         settings = {**_DEFAULT_SPEC.to_json(), **given[ObservationSpec]}
-        settings["corruption"] = given[Corruption]
+        settings["corruption"] = corruption
         return replace(
             convert(given[cls], cls, "condition"), spec=ObservationSpec.from_json(settings)
         )
@@ -123,7 +118,7 @@ class ConditionConfig:
         """
         default, *_ = task.experts
         expert = require_choice("expert", self.expert or default, task.experts)
-        is_plain = self.prediction == "truth" and expert == default and self.motion == "recorded"
+        is_plain = expert == default and self.motion == "recorded"
         if self.name in task.load_study().published and not (
             is_plain and self.spec.name == self.name
         ):
@@ -135,11 +130,8 @@ class ConditionConfig:
 
     def observation(self, preset: ObservationSpec) -> ObservationSpec:
         """Return the spec of the policy: a preset's with the condition's settings in it."""
-        corruption = self.spec.corruption
-        if self.prediction != "truth":  # forecasts are recorded as a predictor's output is
-            corruption = replace(corruption, error="model")
-        given = {name: getattr(self.spec, name) for name in ("obs", "horizon", "relative")}
-        return replace(preset, **given, corruption=corruption)
+        names = ("obs", "horizon", "relative", "corruption")
+        return replace(preset, **{name: getattr(self.spec, name) for name in names})
 
 
 _NOT_OF_A_CONDITION = (

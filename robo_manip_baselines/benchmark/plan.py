@@ -15,7 +15,7 @@ from robo_manip_baselines.benchmark.conditions import (
     DrawnPeople,
 )
 from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, WorkItem
-from robo_manip_baselines.benchmark.worker import FORECAST, LIBRARY, STATS
+from robo_manip_baselines.benchmark.worker import LIBRARY, STATS
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
@@ -167,10 +167,10 @@ class Plan:
     @cached_property
     def runs(self) -> tuple[PlannedRun, ...]:
         """Trainings with their evaluations, in the order of the conditions, then of the seeds."""
-        demonstrations: dict[tuple[str, ...], tuple[WorkItem, ...]] = {}
+        demonstrations: dict[tuple[str, str], tuple[WorkItem, ...]] = {}
         runs: list[PlannedRun] = []
         for condition in self.conditions:
-            variant = condition.expert, condition.prediction, condition.motion
+            variant = condition.expert, condition.motion
             if variant not in demonstrations:
                 demonstrations[variant] = self._demonstrations(condition)
             for train_seed in range(self.preset.train_seeds):
@@ -201,16 +201,13 @@ class Plan:
         return self._evaluation("video", name, seeds, run.condition, run.training)
 
     def _demonstrations(self, condition: ConditionConfig) -> tuple[WorkItem, ...]:
-        prediction, variant = condition.prediction, condition.expert
+        variant = condition.expert
         env_kwargs: dict[str, Any] = {
             "cameras": self.preset.cameras,
             "image_size": ObservationSpec().image_size,
             "face_motion": "episode",
         }
-        if prediction != "truth":
-            variant += f"_{prediction}"
-            env_kwargs["motion_library"] = FORECAST
-        elif self.library:
+        if self.library:
             env_kwargs["motion_library"] = LIBRARY
         if condition.motion != "recorded":
             variant += f"_{re.sub(r'[^a-z0-9._]+', '-', condition.motion)}"
@@ -222,7 +219,7 @@ class Plan:
         for seeds in _blocks(0, self.preset.demonstrations, self.preset.demonstration_block):
             config = Collection(self.env, Path(OUT), condition.expert, seeds, env_kwargs)
             name = f"{variant}_{seeds.start:06d}"
-            settings = {"config": config.to_json(), "prediction": prediction}
+            settings = {"config": config.to_json()}
             item = self._item("demonstrations", name, "run_demonstrations", settings, self._files())
             items.append(replace(item, threads=1, gpus=0.0, seconds=item.seconds * len(seeds)))
         return tuple(items)
@@ -273,7 +270,7 @@ class Plan:
             precision=self.preset.precision,
             videos=int(kind == "video"),
         )
-        settings = {"config": config.to_json(), "prediction": condition.prediction}
+        settings = {"config": config.to_json()}
         item = self._item(kind, name, "run_evaluation", settings, training.files)
         return replace(item, needs=(training,), seconds=item.seconds * len(seeds))
 

@@ -39,9 +39,6 @@ from robo_manip_baselines.runs.versions import source_digest
 LIBRARY = "motion_library.npz"
 """Recorded motion of the user."""
 
-FORECAST = "motion_forecast.npz"
-"""Recorded motion with a forecast of `forecasts` as its predictions."""
-
 STATS = "error_stats.json"
 """Error statistics of the user."""
 
@@ -104,7 +101,6 @@ def run_demonstrations(settings: Mapping[str, Any]) -> None:
     """Record demonstrations; keep the successful ones."""
     from robo_manip_baselines.rollout.demonstrate import Collection, collect
 
-    _write_forecast(settings)
     collect(Collection.from_json(settings["config"]))
     for path in Path(OUT).iterdir():
         if seed_of(path) is None:
@@ -135,16 +131,7 @@ def run_evaluation(settings: Mapping[str, Any]) -> None:
     """Evaluate a policy."""
     from robo_manip_baselines.rollout.evaluation import EvaluationConfig, evaluate
 
-    _write_forecast(settings)
     evaluate(EvaluationConfig.from_json(settings["config"]))
-
-
-def _write_forecast(settings: Mapping[str, Any]) -> None:
-    if settings["prediction"] != "truth":
-        from robo_manip_baselines.benchmark.forecasts import write_library  # 0.6 s to import
-
-        source = Path(LIBRARY) if Path(LIBRARY).exists() else None
-        write_library(Path(FORECAST), source, settings["prediction"])
 
 
 def main() -> int:
@@ -170,7 +157,7 @@ def main() -> int:
             return code
         for name in MOUNTS.values():
             shutil.rmtree(folder / name, ignore_errors=True)
-        for name in (LIBRARY, FORECAST, STATS):
+        for name in (LIBRARY, STATS):
             (folder / name).unlink(missing_ok=True)
         made = (p for p in Path(OUT).rglob("*") if p.is_file() and not p.name.startswith("."))
         files = sorted(path.relative_to(OUT).as_posix() for path in made)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -202,6 +202,7 @@ def load_demonstrations(
     pipeline = spec.make_pipeline()
     paths = _episode_paths(env or folder.name, folder, spec, limit)
     spec = _drawn_as_recorded(spec, read_metadata(paths[0]))
+    forecast = _forecaster(paths[0], spec)
     states: list[NDArray[np.float32]] = []
     actions: list[NDArray[np.float32]] = []
     attributes: list[dict[str, Any]] = []
@@ -212,6 +213,9 @@ def load_demonstrations(
             _require_spec(episode, spec)
             state, target = recorded_state(episode), None
             if pipeline:
+                if forecast:
+                    made = forecast(state.target_position, attributes[-1]["seed"])
+                    state = replace(state, predicted_target=made)
                 target = pipeline.observe_episode(state, attributes[-1]["seed"])
             states.append(spec.pack(state, target))
             actions.append(episode.array("action").astype(np.float32))
@@ -289,6 +293,25 @@ def _frames_ahead(episode: EpisodeReader) -> tuple[int, int]:
     has_prediction = task.predicted_field in episode.fields
     predicted = episode.array(task.predicted_field).shape[1] if has_prediction else 0
     return episode.array(task.target_field).shape[1] - 1, predicted
+
+
+def _forecaster(
+    path: Path, spec: ObservationSpec
+) -> Callable[[NDArray[np.float64], int], NDArray[np.float64]] | None:
+    """Return what makes a forecaster's output of track and seed; None where none is observed.
+
+    Raises:
+        RequestError: the episodes have no such forecasts.
+    """
+    if (name := spec.corruption.prediction) == "truth":
+        return None
+    # Imports the simulator.
+    from robo_manip_baselines.envs.mujoco.face.forecasters import MotionForecasters
+
+    with EpisodeReader(path) as episode:
+        episode.task.require_forecasts(spec.corruption)
+        made = MotionForecasters.of_kwargs(episode.attributes["env_kwargs"])
+    return lambda track, seed: made.forecast_track(name, track, seed)
 
 
 def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:

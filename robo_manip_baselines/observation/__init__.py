@@ -1,6 +1,12 @@
 """Observations: what a policy is shown, packed from the simulator's state after corruption."""
 
-from robo_manip_baselines.observation.corruption import ERRORS, Corruption, CorruptionPipeline
+from robo_manip_baselines.observation.corruption import (
+    ERRORS,
+    FORECASTERS,
+    PREDICTIONS,
+    Corruption,
+    CorruptionPipeline,
+)
 from robo_manip_baselines.observation.spec import (
     ARM_JOINTS,
     CAMERAS,
@@ -20,9 +26,11 @@ __all__ = [
     "ARM_JOINTS",
     "CAMERAS",
     "ERRORS",
+    "FORECASTERS",
     "FRAME_PERIOD",
     "FRAME_RATE",
     "MAX_HORIZON",
+    "PREDICTIONS",
     "PRESETS",
     "Corruption",
     "CorruptionPipeline",

@@ -40,6 +40,15 @@ MEASURED_ERRORS = tuple(DRAWN_ERRORS)
 ERRORS = ("none", *MEASURED_ERRORS, "model")
 """Errors of the forecast; ``model`` is the recorded output of a trained predictor."""
 
+FORECASTERS = (
+    *("persistence", "constant_velocity", "autoregression", "direct_autoregression", "kalman"),
+    "shuffled",
+)
+"""Forecasters that know the past of the target alone; ``shuffled`` is a control."""
+
+PREDICTIONS = ("truth", *FORECASTERS)
+"""Future of the target before errors: the true one, or that of a forecaster."""
+
 MAX_DELAY = 900
 """Frames, half a minute: longer than any episode."""
 
@@ -75,6 +84,9 @@ class Corruption:
         face_dropout_length: Mean length of a loss, frames.
         detector_rate: Detections per second, at most 30; one at every control step if None.
         seed: Seed of errors and losses, beside that of the episode.
+        prediction: Forecast of the target: truth (its true future), or that of a forecaster, made
+            at each control step of the target until then: persistence, constant_velocity,
+            autoregression, direct_autoregression, kalman or shuffled (motion of another episode).
 
     Raises:
         RequestError: a value is not valid.
@@ -88,9 +100,16 @@ class Corruption:
     face_dropout_length: Annotated[float, Interval(ge=1.0, le=1e6)] = DROPOUT_LENGTH
     detector_rate: Annotated[float, Interval(gt=0.0, le=FRAME_RATE)] | None = None
     seed: Annotated[Seed, tyro.conf.arg(name="corruption_seed")] = 0
+    prediction: str = "truth"
 
     def __post_init__(self) -> None:
         require_choice("error model", self.error, ERRORS)
+        require_choice("prediction", self.prediction, PREDICTIONS)
+        if self.prediction != "truth" and self.error != "none":
+            raise RequestError(
+                f"prediction '{self.prediction}' goes without an error, not with '{self.error}'; "
+                "leave one of them out"
+            )
         if self.error_stats is not None and self.error not in MEASURED_ERRORS:
             raise RequestError(
                 f"error_stats '{self.error_stats}' goes with the errors "
@@ -127,7 +146,14 @@ class Corruption:
 
     def __bool__(self) -> bool:
         """Return whether anything is corrupted."""
-        return self.error != "none" or bool(self.delay or self.face_dropout or self.detector_rate)
+        return self.has_forecast_error or bool(
+            self.delay or self.face_dropout or self.detector_rate
+        )
+
+    @property
+    def has_forecast_error(self) -> bool:
+        """True if another future than the true one is observed."""
+        return (self.error, self.prediction) != ("none", "truth")
 
     @property
     def label(self) -> str:
@@ -136,6 +162,8 @@ class Corruption:
         if self.error != "none":
             stem = f"_{Path(self.error_stats).stem}" if self.error_stats else ""
             parts.append(f"{self.error}{stem}")
+        if self.prediction != "truth":
+            parts.append(self.prediction)
         if self.delay:
             parts.append(f"delay{self.delay}")
         if self.face_dropout:
@@ -266,7 +294,7 @@ class CorruptionPipeline:
         A step is later than the one before, or the same once more.
 
         Raises:
-            RequestError: the error needs a predicted target, and there is none.
+            RequestError: a predicted target is to be observed, and there is none.
         """
         self._append(state)
         time, position, *predicted = (known[: self._steps] for known in self._known)
@@ -282,7 +310,7 @@ class CorruptionPipeline:
         """Return the observed target at every step, (T, ...), as `observe` would have.
 
         Raises:
-            RequestError: the error needs a predicted target, and there is none.
+            RequestError: a predicted target is to be observed, and there is none.
         """
         draws = self._draw(seed, int(frame_of(state.time[-1])) + 1)
         return self._observe_at(
@@ -322,6 +350,12 @@ class CorruptionPipeline:
         if error is not None:
             ahead = min(error.shape[1], observed.shape[1] - 1)
             observed[:, 1 : ahead + 1] += error[error_frame, :ahead]
+        elif self.corruption.prediction != "truth":
+            if predicted is None:
+                raise ValueError("a forecaster's output is to be observed, and the state has none")
+            made = np.concatenate([position[row, :1], predicted[row]], axis=1)
+            steps = np.where(between, late / FRAME_PERIOD, 0.0)
+            observed[:, 1:] = _read_off(made, steps, observed.shape[1])[:, 1:]
         elif self.corruption.error == "model":
             frames = 0 if predicted is None else predicted.shape[1]
             if problem := prediction_problem(frames, self.horizon):
@@ -352,6 +386,21 @@ class CorruptionPipeline:
             error = self._draw_error(rng, frames) @ WORLD_FROM_IMAGE
         lost = draw_lost(corruption, _stream(corruption.seed, seed, "lost"), frames)
         return error, DetectionTiming.of(corruption, lost)
+
+
+def _read_off(made: Floats, late: Floats, count: int) -> Floats:
+    """Return forecasts ``late`` frames after they were made, (n, count, 3) m.
+
+    Each is interpolated between two horizons, the last one prolonged: nothing that came after the
+    forecast is used.
+
+    Args:
+        made: (n, H + 1, 3) m, forecasts of 0 ... H frames ahead.
+        late: (n,) frames, less than 1.
+        count: of horizons, from 0 on, at most H + 1.
+    """
+    moves = np.diff(made, axis=1)[:, np.minimum(np.arange(count), made.shape[1] - 2)]
+    return made[:, :count] + late[:, None, None] * moves
 
 
 def prediction_problem(frames: int, horizon: int) -> str:

@@ -155,11 +155,14 @@ class ObservationSpec:
                 f"'{self.obs}' shows nothing; leave it out, or choose current, history or "
                 "current_pred"
             )
-        elif self.obs in ("current", "history") and self.corruption.error != "none":
+        elif self.obs in ("current", "history") and self.corruption.has_forecast_error:
+            error, prediction = self.corruption.error, self.corruption.prediction
+            what, off = ("error", "none") if error != "none" else ("prediction", "truth")
             raise RequestError(
-                f"the error '{self.corruption.error}' is one of forecasts, of which the "
-                f"observation preset '{self.obs}' shows none; choose current_pred, or the error "
-                f"none (delay, face_dropout and detector_rate go with '{self.obs}', too)"
+                f"the {what} '{error if what == 'error' else prediction}' is one of forecasts, of "
+                f"which the observation preset '{self.obs}' shows none; choose current_pred, or "
+                f"the {what} {off} (delay, face_dropout and detector_rate go with '{self.obs}', "
+                "too)"
             )
 
     def _check_render_size(self) -> None:
@@ -185,6 +188,8 @@ class ObservationSpec:
         values |= {"error": self.corruption.error, "arms": arms}
         if not self.relative:
             del values["relative"]
+        if self.corruption.prediction == "truth":
+            del corruption["prediction"]
         return values | {"corruption": corruption} if self.corruption else values
 
     @classmethod

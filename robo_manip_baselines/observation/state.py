@@ -40,8 +40,9 @@ class State:
         end_effector_position: (..., 3) m, gripper site of the right arm.
         target_position: (..., K, 3) m, now and 1 ... K - 1 frames ahead.
         object_position: (..., O, 3) m, centres of the task's objects.
-        predicted_target: (..., H, 3) m, output of a trained predictor for 1 ... H frames ahead;
-            None where the recorded motion holds none.
+        predicted_target: (..., H, 3) m, target 1 ... H frames ahead as forecast by the forecaster
+            whose output is observed, or else by a trained predictor; None where the recorded motion
+            holds none.
     """
 
     time: Floats

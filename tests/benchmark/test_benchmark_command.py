@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.benchmark.conditions import CONDITIONS
-from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.work_item import ArtifactStore
 from robo_manip_baselines.commands import benchmark as command
 from robo_manip_baselines.commands.benchmark import (
@@ -139,9 +138,9 @@ def test_a_condition_that_cannot_be_had_is_left_out_unless_it_is_named(
     assert "left out: condition 'current_pred_h2_model'" in caplog.text
     with pytest.raises(RequestError, match="no predicted mouth"):
         plan_of(options(f"feeding --conditions current_pred_h2_model --motion_library {bare}"))
-    full = tmp_path / "full.npz"
-    write_library(full, None, "persistence")
-    assert len(plan_of(options(f"feeding --motion_library {full}")).conditions) == 16
+    assert len(plan_of(options(f"feeding --motion_library {DEFAULT_LIBRARY}")).conditions) == 16
+    late = plan_of(options(f"foresight_policies --motion_library {bare}")).conditions
+    assert len(late) == 37  # others than `residual` of the library
 
 
 def test_a_dry_run_counts_and_writes_nothing(
@@ -284,7 +283,11 @@ def test_help_names_the_options_and_an_example() -> None:
 
 
 def test_the_conditions_ship_with_the_package() -> None:
-    assert {path.name for path in CONDITIONS.glob("*.yaml")} == {"feeding.yaml", "delay.yaml"}
+    assert {path.name for path in CONDITIONS.glob("*.yaml")} == {
+        "feeding.yaml",
+        "delay.yaml",
+        "foresight_policies.yaml",
+    }
 
 
 def test_options_of_an_earlier_release_are_read_with_a_note(

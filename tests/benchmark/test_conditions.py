@@ -10,6 +10,7 @@ import pytest
 from robo_manip_baselines.benchmark.conditions import (
     CONDITIONS,
     ConditionConfig,
+    DrawnPeople,
     read_conditions,
 )
 from robo_manip_baselines.benchmark.plan import PRESETS
@@ -34,7 +35,8 @@ def test_the_shipped_conditions_are_the_papers_twelve_and_four_more() -> None:
     published = task_entry("FeedingEnv").load_study().published
     assert [c.name for c in file.conditions[:12]] == list(published)
     assert [c.name for c in file.conditions[:12]] == [c.spec.name for c in file.conditions[:12]]
-    assert [(c.spec.corruption.error, c.prediction, c.expert) for c in file.conditions[12:]] == [
+    shown = [(c.spec.corruption.error, c.spec.corruption.prediction) for c in file.conditions]
+    assert [(*pair, c.expert) for pair, c in zip(shown, file.conditions, strict=True)][12:] == [
         ("model", "truth", "reactive"),
         ("none", "persistence", "reactive"),
         ("none", "shuffled", "reactive"),
@@ -47,6 +49,37 @@ def test_the_conditions_of_delay_are_a_whole_grid_and_share_their_runs_with_feed
     cells = [(c.spec.corruption.delay, c.spec.frames - 1) for c in late]
     assert cells == [(delay, horizon) for delay in (0, 4, 8) for horizon in (0, 2, 5)]
     assert set(late[:3]) <= set(read_conditions(CONDITIONS / "feeding.yaml").conditions)
+
+
+def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> None:
+    file = read_conditions(CONDITIONS / "foresight_policies.yaml")
+    assert (file.headline, file.people) == ("success_strict", DrawnPeople("train", "test"))
+    *grid, control = file.conditions
+    assert {c.expert for c in file.conditions} == {"servo"}
+    cells: dict[tuple[str, int], list[str]] = {}
+    for c in grid:
+        spec, corruption = c.spec, c.spec.corruption
+        assert spec.relative
+        shown = spec.obs
+        if spec.obs == "current_pred":
+            is_model = corruption.error == "model"
+            shown = "residual" if is_model else corruption.prediction
+            assert spec.horizon == (5 if is_model else corruption.delay + 12)
+        cell = c.motion, corruption.delay
+        cells.setdefault(cell, []).append(shown)
+        assert c.name == f"{c.motion}_delay{corruption.delay}_{shown}"
+    shown_of_each = ["current", "history", "truth", "persistence"]
+    shown_of_each += ["autoregression", "direct_autoregression"]
+    assert cells == {
+        (motion, delay): shown_of_each + ["residual"] * (motion == "recorded")
+        for motion in ("dyskinetic", "sway", "recorded")
+        for delay in (4, 8)
+    }
+    (like,) = (c for c in grid if c.name == "dyskinetic_delay4_truth")
+    assert control == replace(
+        like, name="dyskinetic_delay4_truth_absolute", spec=replace(like.spec, relative=False)
+    )
+    assert len(file.choose(file.presets["smoke"])) == 3
 
 
 def test_the_conditions_of_the_presets_are_there() -> None:
@@ -68,7 +101,12 @@ def test_the_conditions_of_the_presets_are_there() -> None:
             condition(name="a", horizon=3, error="uniform", delay=2),
             {"horizon": 3, "corruption": Corruption("uniform", delay=2)},
         ),
-        (condition(name="a", prediction="shuffled"), {"corruption": Corruption("model")}),
+        (
+            condition(name="a", prediction="shuffled", motion="sway", delay=4, relative=True),
+            {"corruption": Corruption(prediction="shuffled", delay=4), "relative": True},
+        ),
+        (condition(name="a", prediction="model"), {"corruption": Corruption("model")}),
+        (condition(name="a", prediction="truth"), {}),
         (
             condition(
                 name="a",
@@ -125,12 +163,14 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
         ("- {name: a, obs: baseline, delay: 2}", ["line 3", "baseline"]),
         ("- {name: a, policy: Atc}", ["line 3", "did you mean 'Act'"]),
         ("- {name: a, expert: quick}", ["line 3", "anticipatory, reactive"]),
-        ("- {name: a, prediction: frozen}", ["line 3", "persistence, shuffled, truth"]),
+        ("- {name: a, prediction: frozen}", ["line 3", "model, persistence, shuffled, truth"]),
+        ("- {name: a, prediction: 3}", ["line 3", "prediction '3'"]),
         ("- {name: a, prediction: shuffled, error: uniform}", ["line 3", "without an error"]),
+        ("- {name: a, prediction: model, error: uniform}", ["line 3", "without an error"]),
         ("- {name: a, prediction: shuffled, obs: current}", ["line 3", "current_pred"]),
         ("- {name: a, motion: swai}", ["line 3", "did you mean 'sway'"]),
         ("- {name: a, motion: {amplitude: 1}}", ["line 3", "no name", "sway"]),
-        ("- {name: a, motion: sway, prediction: shuffled}", ["line 3", "'sway'", "leave one"]),
+        ("- {name: a, motion: sway, prediction: model}", ["line 3", "'sway'", "recorded motion"]),
         ("- {name: a, motion: sway, error: model}", ["line 3", "recorded motion"]),
         ("- {name: current, obs: current, motion: sway}", ["line 3", "of the paper"]),
         ("- {obs: current}", ["line 3", "no name"]),

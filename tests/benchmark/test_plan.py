@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,6 @@ from robo_manip_baselines.benchmark.conditions import (
     DrawnPeople,
     read_conditions,
 )
-from robo_manip_baselines.benchmark.forecasts import write_library
 from robo_manip_baselines.benchmark.plan import PRESETS, BenchmarkPreset, Plan, make_plan
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
@@ -50,14 +50,16 @@ def keys(made: Plan, kind: str) -> list[str]:
 def test_conditions_share_demonstrations_and_nothing_else() -> None:
     other = changed(name="aim", expert="anticipatory")
     frozen = changed(name="frozen", prediction="persistence")
-    made = plan(CURRENT, AHEAD, other, frozen)
+    late = changed(name="late", prediction="kalman", delay=4, motion="sway")
+    made = plan(CURRENT, AHEAD, other, frozen, late)
     needs = {run.condition.name: [need.name for need in run.training.needs] for run in made.runs}
     assert needs["current"] == needs["current_pred_h2"] == ["reactive_000000", "reactive_000002"]
     assert needs["aim"] == ["anticipatory_000000", "anticipatory_000002"]
-    assert needs["frozen"] == ["reactive_persistence_000000", "reactive_persistence_000002"]
+    assert needs["frozen"] == needs["current"]  # forecasts are made when they are read
+    assert needs["late"] == ["reactive_sway_000000", "reactive_sway_000002"]
     assert len(keys(made, "demonstrations")) == 6
-    assert len(keys(made, "training")) == 4
-    assert len(keys(made, "evaluation")) == 8
+    assert len(keys(made, "training")) == 5
+    assert len(keys(made, "evaluation")) == 10
 
 
 def test_a_motion_has_demonstrations_of_its_own_in_which_evaluations_act() -> None:
@@ -125,7 +127,7 @@ def test_whatever_changes_the_outcome_changes_the_key(
     base = plan(AHEAD)
     stats, library = tmp_path / "e.json", tmp_path / "l.npz"
     stats.write_bytes(DEFAULT_STATS.read_bytes() + b"\n")
-    write_library(library, None, "persistence")
+    shutil.copy(DEFAULT_LIBRARY, library)
     other = tmp_path / "other" / "e.json"
     other.parent.mkdir()
     other.write_bytes(DEFAULT_STATS.read_bytes() + b"\n\n")
@@ -136,6 +138,7 @@ def test_whatever_changes_the_outcome_changes_the_key(
         "other stats": plan(changed(error="uniform"), error_stats=other),
         "expert": plan(changed(expert="anticipatory")),
         "forecast": plan(changed(prediction="persistence")),
+        "model": plan(changed(prediction="model")),
         "library": plan(AHEAD, library=library),
         "motion": plan(changed(motion="sway")),
         "policy": plan(changed(policy="Mlp")),
@@ -181,11 +184,10 @@ def test_shards_have_every_run_once_and_what_it_needs(parts: int) -> None:
 
 
 def test_a_condition_that_shows_a_predictor_needs_predictions(tmp_path: Path) -> None:
-    library, bare = tmp_path / "l.npz", tmp_path / "bare.npz"
-    write_library(library, None, "persistence")
+    bare = tmp_path / "bare.npz"
     condition = changed(name="m", error="model")
-    assert plan(condition, library=library).runs
-    _without_prediction(library, bare)
+    assert plan(condition, library=DEFAULT_LIBRARY).runs
+    _without_prediction(DEFAULT_LIBRARY, bare)
     with pytest.raises(
         RequestError, match=r"condition 'm'.*--motion_library.*leave the condition out"
     ):
@@ -204,20 +206,25 @@ def test_a_policy_without_the_presets_settings_is_refused_before_anything_runs()
         plan(changed(policy="Mlp"), preset=PRESETS["paper"]).items()
 
 
-def test_the_shipped_benchmarks_can_be_planned(tmp_path: Path) -> None:
-    library = tmp_path / "l.npz"
-    write_library(library, None, "persistence")
+def test_the_shipped_benchmarks_can_be_planned() -> None:
     conditions = read_conditions(CONDITIONS / "feeding.yaml").conditions
-    made = plan(*conditions, preset=PRESETS["cpu"], library=library)
+    made = plan(*conditions, preset=PRESETS["cpu"], library=DEFAULT_LIBRARY)
     assert {
         kind: len(keys(made, kind)) for kind in ("demonstrations", "training", "evaluation")
-    } == {"demonstrations": 8, "training": 16, "evaluation": 32}
+    } == {"demonstrations": 4, "training": 16, "evaluation": 32}
     names = [
         item.settings["config"]["env_kwargs"]["motion_library"]
         for item in made.items()
         if item.kind == "demonstrations"
     ]
-    assert set(names) == {"motion_library.npz", "motion_forecast.npz"}
+    assert set(names) == {"motion_library.npz"}
+    file = read_conditions(CONDITIONS / "foresight_policies.yaml")
+    made = make_plan(
+        file.env, file.conditions, PRESETS["cpu"], headline=file.headline, people=file.people
+    )
+    assert {
+        kind: len(keys(made, kind)) for kind in ("demonstrations", "training", "evaluation")
+    } == {"demonstrations": 6, "training": 39, "evaluation": 78}
 
 
 @pytest.mark.parametrize(
@@ -225,6 +232,8 @@ def test_the_shipped_benchmarks_can_be_planned(tmp_path: Path) -> None:
     [
         ({"horizon": 24}, ""),
         ({"horizon": 24, "prediction": "persistence"}, ""),
+        ({"horizon": 24, "prediction": "kalman", "motion": "sway"}, ""),
+        ({"horizon": 6, "prediction": "model"}, r"'far' .* predicts the mouth 5 frames ahead"),
         ({"horizon": 5, "error": "uniform"}, ""),
         ({"horizon": 6, "error": "uniform"}, r"'far': error statistics .* go 5 frames ahead"),
         ({"horizon": 6, "error": "empirical"}, r"'far': error statistics .* go 5 frames ahead"),

@@ -102,7 +102,7 @@ def test_files_from_outside_and_forecasts_reach_the_policy(tmp_path: Path) -> No
     )
     conditions = (
         ConditionConfig.from_yaml({"name": "erring", "policy": "Mlp", "error": "gaussian"}),
-        ConditionConfig("shuffled", policy="Mlp", prediction="shuffled"),
+        ConditionConfig.from_yaml({"name": "shuffled", "policy": "Mlp", "prediction": "shuffled"}),
     )
     plan = make_plan("FeedingEnv", conditions, size, library=library, error_stats=stats)
     store, items = ArtifactStore(tmp_path / "items"), plan.items()
@@ -114,7 +114,7 @@ def test_files_from_outside_and_forecasts_reach_the_policy(tmp_path: Path) -> No
     assert erring.spec.corruption
     assert erring.spec.corruption.error_stats == "error_stats.json"
     assert erring.dataset["env_kwargs"]["motion_library"] == "motion_library.npz"
-    assert shuffled.spec.corruption == Corruption("model")
-    assert shuffled.dataset["env_kwargs"]["motion_library"] == "motion_forecast.npz"
+    assert shuffled.spec.corruption == Corruption(prediction="shuffled")
+    assert shuffled.dataset == erring.dataset
     left = {path.name for item in items for path in store.folder(item).iterdir()}
     assert left == {"out", "item.json", "log.txt", ".lock"}

@@ -11,9 +11,12 @@ from numpy.typing import ArrayLike
 
 from robo_manip_baselines.benchmark.foresight.forecasters import (
     FORECASTERS,
+    Forecasters,
+    residual_horizon,
+)
+from robo_manip_baselines.envs.mujoco.face.forecasters import (
     KALMAN_MEMORY,
     MAX_LEAD,
-    Forecasters,
     LinearForecaster,
     autoregression,
     constant_velocity,
@@ -21,7 +24,6 @@ from robo_manip_baselines.benchmark.foresight.forecasters import (
     fit_kalman,
     kalman,
     persistence,
-    residual_horizon,
 )
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.observation import FRAME_PERIOD

@@ -58,6 +58,8 @@ def test_every_measured_error_can_be_drawn() -> None:
         (Corruption("uniform"), "uniform"),
         (Corruption("gaussian", "a/mine.json"), "gaussian_mine"),
         (Corruption(delay=3), "delay3"),
+        (Corruption(prediction="kalman"), "kalman"),
+        (Corruption(prediction="persistence", delay=3), "persistence_delay3"),
         (Corruption("model", delay=2, detector_rate=10.0), "model_delay2_rate10"),
         (Corruption(face_dropout=0.1), "dropout0.1"),
         (Corruption(face_dropout=0.1, face_dropout_length=30), "dropout0.1x30"),
@@ -97,7 +99,10 @@ def test_there_must_be_something_to_corrupt(
         ObservationSpec(obs=obs, corruption=corruption)
 
 
-@pytest.mark.parametrize("values", [{}, {"error": "uniform", "delay": 2}, {"detector_rate": 10.0}])
+@pytest.mark.parametrize(
+    "values",
+    [{}, {"error": "uniform", "delay": 2}, {"detector_rate": 10.0}, {"prediction": "kalman"}],
+)
 def test_a_spec_goes_through_json(values: dict[str, Any]) -> None:
     corruption = Corruption(**values)
     spec = ObservationSpec(obs="current_pred", cameras=("top",), corruption=corruption)

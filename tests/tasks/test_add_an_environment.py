@@ -120,6 +120,8 @@ def test_its_target_is_observed_and_has_no_forecast(chin_touch: str) -> None:
         np.testing.assert_allclose(observation["chin"][:3], chin, atol=1e-6)  # float32
     with pytest.raises(RequestError, match=r"error model: predictors forecast the mouth, not"):
         make_env(chin_touch, obs="current_pred", cameras=(), corruption={"error": "model"})
+    with pytest.raises(RequestError, match=r"prediction kalman: predictors forecast the mouth"):
+        make_env(chin_touch, obs="current_pred", cameras=(), corruption={"prediction": "kalman"})
     with pytest.raises(RequestError, match="object_pose: ChinTouchEnv has no objects"):
         make_env(chin_touch, object_pose=True, cameras=())
 

@@ -111,6 +111,7 @@ def test_one_budget_replaces_the_other(
         "Act --preset cpu --error uniform --delay 3 --face_dropout 0.1 --dropout 0.2",
         "Mlp --obs current --detector_rate 10 --face_dropout_length 4 --corruption_seed 2",
         "Mlp --error gaussian --error_stats a/b.json --no_corruption",
+        "Mlp --prediction autoregression --horizon 16 --delay 4 --relative",
     ],
 )
 def test_saved_options_read_back_as_they_were(tmp_path: Path, line: str) -> None:
@@ -122,7 +123,14 @@ def test_saved_options_read_back_as_they_were(tmp_path: Path, line: str) -> None
 def test_runs_of_older_releases_are_the_same_runs(tmp_path: Path) -> None:
     """Their config.yaml knows of no corruption but ``error: none``."""
     values = parse("Mlp").to_json()
-    new = ("error_stats", "delay", "face_dropout", "face_dropout_length", "detector_rate")
+    new = (
+        "error_stats",
+        "prediction",
+        "delay",
+        "face_dropout",
+        "face_dropout_length",
+        "detector_rate",
+    )
     dropped = (*new, "corruption_seed", "out")
     old = {name: value for name, value in values.items() if name not in dropped}
     assert old["error"] == "none"

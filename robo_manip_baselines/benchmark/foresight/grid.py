@@ -12,8 +12,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from robo_manip_baselines.benchmark.foresight.episodes import Cell, plan_age
-from robo_manip_baselines.benchmark.foresight.forecasters import MAX_LEAD
 from robo_manip_baselines.envs.mujoco.expert.servo import ARM_LAG
+from robo_manip_baselines.envs.mujoco.face.forecasters import MAX_LEAD
 
 STEP = 3
 """Frames between the leads beside the expected one."""

@@ -16,7 +16,7 @@ from robo_manip_baselines.benchmark.foresight.analysis import (
     Setting,
 )
 from robo_manip_baselines.benchmark.foresight.episodes import CHUNK_SIZE, EXECUTIONS, plan_age
-from robo_manip_baselines.benchmark.foresight.forecasters import FORECASTERS, MAX_LEAD
+from robo_manip_baselines.benchmark.foresight.forecasters import FORECASTERS
 from robo_manip_baselines.benchmark.foresight.grid import expected_lead
 from robo_manip_baselines.benchmark.report.figures import (
     BLUE,
@@ -40,6 +40,7 @@ from robo_manip_baselines.benchmark.tables.table import (
     write_tables,
 )
 from robo_manip_baselines.envs.mujoco.expert.servo import ARM_LAG
+from robo_manip_baselines.envs.mujoco.face.forecasters import MAX_LEAD
 from robo_manip_baselines.rollout.results import Proportion
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
@@ -54,7 +55,9 @@ EXECUTION_TITLES = {
     "ensemble": f"chunks of {CHUNK_SIZE}, ensemble",
 }
 
-FORECASTER_COLORS = dict(zip(FORECASTERS, (INK, GREY, ORANGE, BLUE, GREEN, PINK, RED), strict=True))
+FORECASTER_COLORS = dict(
+    zip(FORECASTERS, (INK, GREY, ORANGE, BLUE, GREEN, PINK, RED, SKY), strict=True)
+)
 
 
 # -- tables ---------------------------------------------------------------------------------------

@@ -18,6 +18,10 @@ from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, Ca
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
+from robo_manip_baselines.envs.mujoco.face.forecasters import (
+    MotionForecasters,
+    require_no_waiting,
+)
 from robo_manip_baselines.envs.mujoco.face.model import rotate
 from robo_manip_baselines.envs.mujoco.face.motion import (
     SEGMENT_DURATION,
@@ -154,12 +158,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.library.require(motion_sha256)
         if self.motion.recorded is not None:
             self.library.part(self.people)  # refuses what cannot be split
+        self.task.require_forecasts(spec.corruption)
+        self._forecasters: MotionForecasters | None = None
+        if spec.corruption.prediction != "truth":
+            require_no_waiting(self.face_motion)
+            self._forecasters = MotionForecasters.of(self.motion, self.library, self.people)
         if spec.corruption.error == "model":
-            if not self.task.predicted_field:
-                raise RequestError(
-                    f"error model: predictors forecast the mouth, not the {self.task.names.target} "
-                    f"of {self.task.name}; choose another error"
-                )
             if problem := prediction_problem(self.library.predicted_frames, spec.horizon):
                 raise RequestError(f"motion library '{self.library.source}' holds {problem}")
             if not self.motion.is_as_recorded:
@@ -294,7 +298,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         mujoco.mj_forward(self.model, self.data)
         if self._pipeline:
             # Last, so that the world is the same as without corruption.
-            self._pipeline.reset(int(self.np_random.integers(2**32)) if seed is None else seed)
+            drawn = int(self.np_random.integers(2**32)) if seed is None else seed
+            self._pipeline.reset(drawn)
+            if self._forecasters:
+                self._forecast = self._forecasters.forecast_track(
+                    self.observation_spec.corruption.prediction, self.replay.mouth, drawn
+                )
         self._stage = "reset"
         self._show()
         return self.observe(), self.info()
@@ -497,7 +506,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             end_effector_position=self.gripper_position,
             target_position=self.target_track(),
             object_position=self.object_position(),
-            predicted_target=self.predicted_target(),
+            predicted_target=self._forecast[self._row()].copy()
+            if self._forecasters
+            else self.predicted_target(),
         )
 
     def observe(self) -> dict[str, NDArray[Any]]:

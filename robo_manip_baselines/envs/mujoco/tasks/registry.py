@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.observation import ObservedNames
+from robo_manip_baselines.observation import Corruption, ObservedNames
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 NAMESPACE = "robo_manip_baselines"
@@ -268,6 +268,20 @@ class TaskEntry:
     def make_metrics(self) -> EpisodeMetrics:
         """Make the metrics of one episode."""
         return load_part(self.metrics)()
+
+    def require_forecasts(self, corruption: Corruption) -> None:
+        """Require that the target is the mouth, which is what is forecast, if forecasts are shown.
+
+        Raises:
+            RequestError: it is another point of the face.
+        """
+        shown = corruption.prediction != "truth" and f"prediction {corruption.prediction}"
+        shown = shown or (corruption.error == "model" and "error model")
+        if shown and not self.predicted_field:
+            raise RequestError(
+                f"{shown}: predictors forecast the mouth, not the {self.names.target} of "
+                f"{self.name}; choose another one"
+            )
 
     def load_study(self) -> TaskStudy:
         """Return published results, claims and figures."""
