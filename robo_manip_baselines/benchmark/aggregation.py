@@ -115,12 +115,13 @@ def write_aggregation(
         ]
         with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV and OpenCV let go of the GIL
             clips = list(pool.map(lambda video: read_video(*video), drawn))
-        facts = {
-            "Command": command,
-            "Demonstrations": f"{preset.demonstrations} of each expert, "
-            + (f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"),
-            "People": str(plan.people),
-        }
+        facts = {"Command": command}
+        if any(run.training for run in plan.runs):
+            views = f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"
+            facts["Demonstrations"] = f"{preset.demonstrations} of each expert, {views}"
+        if trained := [condition for condition in plan.conditions if condition.checkpoint]:
+            facts["Trained already"] = ", ".join(f"{c.name}: {c.checkpoint}" for c in trained)
+        facts["People"] = str(plan.people)
         title, caution = f"Benchmark {plan.env}", preset.caution
         report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
         written = write_tables(out / TABLES, report.tables)
