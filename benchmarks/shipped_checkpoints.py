@@ -62,7 +62,7 @@ MAX_BYTES = 3_000_000
 EXAMPLE = "python benchmarks/shipped_checkpoints.py --work shipped_runs"
 
 NOT_RECORDED = frozenset({"policy", "env", "dataset", "num_episodes", "preset", "device", "out"})
-"""Options of a run that its recorded command lacks, because they are named first or do not matter."""
+"""Options of a run that its recorded command lacks: named first, or without effect on weights."""
 
 
 @dataclass(frozen=True)

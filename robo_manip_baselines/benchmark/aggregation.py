@@ -20,9 +20,14 @@ from robo_manip_baselines.benchmark.report.page import (
     read_video,
     write_report,
 )
-from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.benchmark.statistics.analysis import (
+    BenchmarkStatistics,
+    ConditionStatistics,
+    analyze,
+)
 from robo_manip_baselines.benchmark.statistics.conditions import describe_condition
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, read_result_rows
+from robo_manip_baselines.benchmark.tables.benchmark import mean_and_p90
 from robo_manip_baselines.benchmark.tables.table import write_tables
 from robo_manip_baselines.benchmark.work_item import (
     ITEMS,
@@ -135,12 +140,26 @@ def write_aggregation(
 
 
 def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
-    """Lay out the table that the command prints at its end."""
-    rows = {
-        c.condition.label: f"{c.outcomes.episodes:4d} episodes, {statistics.end_point} "
-        f"{statistics.rate(c)}"
-        for c in statistics.conditions
-    }
+    """Lay out the table that the command prints at its end: both rates, and the peak force.
+
+    The interval is that of the end point; of the task's columns in tables, the first one is shown.
+    """
+    columns = [column for column in statistics.task.columns if column.in_tables][:1]
+    other = {"success": "strict success", "strict": "success"}[statistics.measure]
+
+    def row(c: ConditionStatistics) -> str:
+        rate = c.success.rate if statistics.measure == "strict" else c.strict.rate
+        parts = [
+            f"{c.outcomes.episodes:4d} episodes",
+            f"{statistics.end_point} {statistics.rate(c)}",
+            f"{other} {rate or 0.0:.1%}",
+        ]
+        for column in columns:
+            if (mean := mean_and_p90(c, column)[0]) is not None:
+                parts.append(f"mean {column.name.replace('_', ' ')} {mean:.1f} {column.unit}")
+        return ", ".join(parts)
+
+    rows = {c.condition.label: row(c) for c in statistics.conditions}
     return closing_table(rows | {"tables": str(out / TABLES), "report": str(out / REPORT)})
 
 
