@@ -134,7 +134,7 @@ class VideoWriter:
         if image.shape != self._shape:
             raise ValueError(f"frame of {image.shape} in a video of {self._shape}")
         # Planes of 4:2:0, by OpenCV: the conversion inside PyAV takes five times as long.
-        planes = cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420)
+        planes = np.asarray(cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420), np.uint8)
         frame = self._frame_type.from_ndarray(planes, format="yuv420p")
         self._container.mux(self._stream.encode(frame))
 

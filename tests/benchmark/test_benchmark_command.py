@@ -284,7 +284,11 @@ def test_help_names_the_options_and_an_example() -> None:
 
 
 def test_the_conditions_ship_with_the_package() -> None:
-    assert {path.name for path in CONDITIONS.glob("*.yaml")} == {"feeding.yaml", "delay.yaml"}
+    assert {path.name for path in CONDITIONS.glob("*.yaml")} == {
+        "delay.yaml",
+        "demo.yaml",
+        "feeding.yaml",
+    }
 
 
 def test_options_of_an_earlier_release_are_read_with_a_note(
