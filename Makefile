@@ -21,7 +21,7 @@ help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "Options: PYTHON=python3.12 (makes .venv with it), MUJOCO_GL=egl|osmesa|glfw, PYTEST_ARGS='-k name'"
 
-demo: setup opengl ## five scripted episodes, a preview video, and three trained policies compared (4 minutes)
+demo: setup opengl ## five scripted episodes, a preview video, and three trained policies compared (4 min)
 	$(BIN)/python bin/Rollout.py FeedingEnv --scripted --expert servo --motion dyskinetic --cameras none \
 	  --num_episodes 5 --out $(DEMO_DIR)
 	$(BIN)/python bin/Dataset.py verify $(DEMO_DIR)

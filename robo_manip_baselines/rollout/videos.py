@@ -55,8 +55,9 @@ VIEW_SIZE = (360, 480)
 PREVIEW_SIZE = (240, 320)
 """Likewise in a preview, which has to be fast: a renderer without a GPU pays for each pixel."""
 
-LOOK = {"image_size": VIEW_SIZE, "render_size": None, "shadows": True, "multisamples": 4}
-"""Arguments of an environment whose images are for people."""
+LOOK = {"image_size": VIEW_SIZE, "render_size": None, "multisamples": 4}
+"""Arguments of an environment whose images are for people: with smooth edges, and without shadows,
+which take three times as long on a CPU (116 and 37 ms for three views)."""
 
 THREADS = 2
 """Threads that draw frames while others are rendered and encoded."""
