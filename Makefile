@@ -7,25 +7,30 @@ MAKEFLAGS += --no-print-directory
 PYTHON ?=
 WITH_TORCH ?= 0
 PYTEST_ARGS ?=
-DEMO_DIR ?= dataset/FeedingEnv_demo
-DEMO_RESULTS ?= results/feeding_demo
+DEMO_DIR ?= dataset/demo
+DEMO_RESULTS ?= results/demo
+SMOKE_RESULTS ?= results/feeding_smoke
 BIN := .venv/bin
 ifeq ($(shell uname),Linux)
 export MUJOCO_GL ?= egl
 endif
 
-.PHONY: help demo test test-fast test-slow check format setup opengl wheelhouse clean
+.PHONY: help demo smoke test test-fast test-slow check format setup opengl wheelhouse clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "Options: PYTHON=python3.12 (makes .venv with it), MUJOCO_GL=egl|osmesa|glfw, PYTEST_ARGS='-k name'"
 
-demo: setup opengl ## five scripted feeding episodes, a preview video, and a benchmark in miniature
-	$(BIN)/python bin/Rollout.py FeedingEnv --scripted --num_episodes 5 --out $(DEMO_DIR)
+demo: setup opengl ## five scripted episodes, a preview video, and three trained policies compared (4 min)
+	$(BIN)/python bin/Rollout.py FeedingEnv --scripted --expert servo --motion dyskinetic --cameras none \
+	  --num_episodes 5 --out $(DEMO_DIR)
 	$(BIN)/python bin/Dataset.py verify $(DEMO_DIR)
-	$(BIN)/python bin/Benchmark.py feeding --preset smoke --out $(DEMO_RESULTS)
+	$(BIN)/python bin/Benchmark.py demo --num_episodes 20 --reference shipped_current --out $(DEMO_RESULTS)
 	@echo "Preview video: $$(ls $(DEMO_DIR)/*.mp4)"
 	@echo "Report: $(DEMO_RESULTS)/report.html"
+
+smoke: setup opengl ## a benchmark in miniature, trainings included (3 minutes); part of what CI runs
+	$(BIN)/python bin/Benchmark.py feeding --preset smoke --out $(SMOKE_RESULTS)
 
 test: setup opengl ## every test but the slow ones (about 12 minutes on two cores)
 	$(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import cv2
 
-from robo_manip_baselines.rollout.videos import preview_frames
+from robo_manip_baselines.rollout.videos import VIEW_SIZE, preview_frames
 from robo_manip_baselines.runs.command import run_command
 
-EPISODE = Path("dataset/FeedingEnv_demo/episode_000000.hdf5")
+EPISODE = Path("dataset/demo/episode_000000.hdf5")
 FRAME = 150  # 6 s, on the way to the mouth
 
 
 def main() -> None:
-    frame = next(islice(preview_frames(EPISODE), FRAME, None))
+    frame = next(islice(preview_frames(EPISODE, VIEW_SIZE), FRAME, None))
     path = Path(__file__).parent / "demo.png"
     cv2.imwrite(str(path), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
     print(path)

@@ -20,9 +20,14 @@ from robo_manip_baselines.benchmark.report.page import (
     read_video,
     write_report,
 )
-from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
+from robo_manip_baselines.benchmark.statistics.analysis import (
+    BenchmarkStatistics,
+    ConditionStatistics,
+    analyze,
+)
 from robo_manip_baselines.benchmark.statistics.conditions import describe_condition
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, read_result_rows
+from robo_manip_baselines.benchmark.tables.benchmark import mean_and_p90
 from robo_manip_baselines.benchmark.tables.table import write_tables
 from robo_manip_baselines.benchmark.work_item import (
     ITEMS,
@@ -115,12 +120,13 @@ def write_aggregation(
         ]
         with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV and OpenCV let go of the GIL
             clips = list(pool.map(lambda video: read_video(*video), drawn))
-        facts = {
-            "Command": command,
-            "Demonstrations": f"{preset.demonstrations} of each expert, "
-            + (f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"),
-            "People": str(plan.people),
-        }
+        facts = {"Command": command}
+        if any(run.training for run in plan.runs):
+            views = f"cameras {', '.join(preset.cameras)}" if preset.cameras else "without images"
+            facts["Demonstrations"] = f"{preset.demonstrations} of each expert, {views}"
+        if trained := [condition for condition in plan.conditions if condition.checkpoint]:
+            facts["Trained already"] = ", ".join(f"{c.name}: {c.checkpoint}" for c in trained)
+        facts["People"] = str(plan.people)
         title, caution = f"Benchmark {plan.env}", preset.caution
         report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
         written = write_tables(out / TABLES, report.tables)
@@ -134,12 +140,26 @@ def write_aggregation(
 
 
 def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
-    """Lay out the table that the command prints at its end."""
-    rows = {
-        c.condition.label: f"{c.outcomes.episodes:4d} episodes, {statistics.end_point} "
-        f"{statistics.rate(c)}"
-        for c in statistics.conditions
-    }
+    """Lay out the table that the command prints at its end: both rates, and the peak force.
+
+    The interval is that of the end point; of the task's columns in tables, the first one is shown.
+    """
+    columns = [column for column in statistics.task.columns if column.in_tables][:1]
+    other = {"success": "strict success", "strict": "success"}[statistics.measure]
+
+    def row(c: ConditionStatistics) -> str:
+        rate = c.success.rate if statistics.measure == "strict" else c.strict.rate
+        parts = [
+            f"{c.outcomes.episodes:4d} episodes",
+            f"{statistics.end_point} {statistics.rate(c)}",
+            f"{other} {rate or 0.0:.1%}",
+        ]
+        for column in columns:
+            if (mean := mean_and_p90(c, column)[0]) is not None:
+                parts.append(f"mean {column.name.replace('_', ' ')} {mean:.1f} {column.unit}")
+        return ", ".join(parts)
+
+    rows = {c.condition.label: row(c) for c in statistics.conditions}
     return closing_table(rows | {"tables": str(out / TABLES), "report": str(out / REPORT)})
 
 

@@ -21,6 +21,7 @@ from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
 from robo_manip_baselines.observation import PREDICTIONS, Corruption, ObservationSpec
+from robo_manip_baselines.policy.checkpoint import read_checkpoint
 from robo_manip_baselines.policy.registry import policy_entry
 from robo_manip_baselines.runs.documents import convert, load_yaml, shortened
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_printable
@@ -53,6 +54,8 @@ class ConditionConfig:
         motion: of the face in demonstrations and evaluation, as text that `parse_motion` reads; in
             YAML a mapping or a list, too.
         title: in tables and figures; made from the observations if empty.
+        checkpoint: trained policy to evaluate, a folder or ``shipped:NAME``; empty to train one.
+            Policy and observations are the checkpoint's then, see `of_checkpoint`.
 
     Raises:
         RequestError: a value is not valid.
@@ -64,6 +67,7 @@ class ConditionConfig:
     expert: str = ""
     motion: str = "recorded"
     title: str = ""
+    checkpoint: str = ""
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -103,22 +107,63 @@ class ConditionConfig:
             require_choice("prediction", corruption["prediction"], (*PREDICTIONS, MODEL))
         if "name" not in given[cls]:
             raise RequestError("the condition has no name; add 'name: ...'")
+        if "checkpoint" in given[cls]:
+            for key in values:
+                if key not in _OF_A_CHECKPOINT:
+                    raise RequestError(
+                        f"'{key}' is what a policy is trained with, and 'checkpoint' is trained; "
+                        f"beside it go {', '.join(_OF_A_CHECKPOINT)}"
+                    )
+            own = convert(given[cls], cls, "condition")
+            motion = own.motion if "motion" in values else ""
+            return cls.of_checkpoint(own.name, own.checkpoint, motion=motion, title=own.title)
         settings = {**_DEFAULT_SPEC.to_json(), **given[ObservationSpec]}
         settings["corruption"] = corruption
         return replace(
             convert(given[cls], cls, "condition"), spec=ObservationSpec.from_json(settings)
         )
 
+    @classmethod
+    def of_checkpoint(
+        cls, name: str, checkpoint: str, *, motion: str = "", title: str = ""
+    ) -> ConditionConfig:
+        """Make a condition of a policy that is trained already.
+
+        Args:
+            name: of the condition.
+            checkpoint: folder of a run or of a checkpoint, or ``shipped:NAME``.
+            motion: of the face; that of the checkpoint's demonstrations if empty.
+            title: in tables and figures.
+
+        Raises:
+            RequestError: the checkpoint cannot be read, or a value is not valid.
+        """
+        read = read_checkpoint(checkpoint)
+        trained = read.dataset.get("env_kwargs", {}).get("motion", "recorded")
+        return cls(
+            name,
+            read.policy,
+            read.spec,
+            motion=motion or trained,
+            title=title,
+            checkpoint=checkpoint,
+        )
+
     def for_task(self, task: TaskEntry) -> ConditionConfig:
         """Return the condition with the task's default expert, if none is given.
 
         Raises:
-            RequestError: the task has no such expert, or its paper has another condition of that
-                name.
+            RequestError: the task has no such expert, its paper has another condition of that
+                name, or the checkpoint is of another task.
         """
+        if self.checkpoint and (trained := read_checkpoint(self.checkpoint).env) != task.name:
+            raise RequestError(
+                f"checkpoint '{self.checkpoint}' was trained in {trained}, not in {task.name}; "
+                "leave the condition out"
+            )
         default, *_ = task.experts
         expert = require_choice("expert", self.expert or default, task.experts)
-        is_plain = expert == default and self.motion == "recorded"
+        is_plain = expert == default and self.motion == "recorded" and not self.checkpoint
         if self.name in task.load_study().published and not (
             is_plain and self.spec.name == self.name
         ):
@@ -133,6 +178,9 @@ class ConditionConfig:
         names = ("obs", "horizon", "relative", "corruption")
         return replace(preset, **{name: getattr(self.spec, name) for name in names})
 
+
+_OF_A_CHECKPOINT = ("name", "checkpoint", "motion", "title")
+"""Keys of an entry whose policy is trained already."""
 
 _NOT_OF_A_CONDITION = (
     # Of the preset:

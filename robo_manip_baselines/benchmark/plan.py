@@ -22,9 +22,11 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.observation.error_stats import load_error_stats
+from robo_manip_baselines.policy.checkpoint import ACTING_FILES, read_checkpoint
 from robo_manip_baselines.rollout.demonstrate import Collection
 from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.runs.checkpoints import MANIFEST
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.ranges import Amount, Count, Episodes, require_ranges
 from robo_manip_baselines.training.config import BUDGET_OPTIONS, TrainConfig
@@ -133,14 +135,19 @@ class PlannedRun:
     Attributes:
         condition: of the run.
         train_seed: of the training.
-        training: work item.
+        training: work item; None where the condition's policy is trained already.
         evaluations: work items, in the order of their seeds.
     """
 
     condition: ConditionConfig
     train_seed: int
-    training: WorkItem
+    training: WorkItem | None
     evaluations: tuple[WorkItem, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of its work items."""
+        return f"{self.condition.name}_seed{self.train_seed}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +177,9 @@ class Plan:
         demonstrations: dict[tuple[str, str], tuple[WorkItem, ...]] = {}
         runs: list[PlannedRun] = []
         for condition in self.conditions:
+            if condition.checkpoint:
+                runs.append(self._run_of_checkpoint(condition))
+                continue
             variant = condition.expert, condition.motion
             if variant not in demonstrations:
                 demonstrations[variant] = self._demonstrations(condition)
@@ -187,18 +197,20 @@ class Plan:
                 and all demonstrations that these need. All items if None.
         """
         runs = self.runs if shard is None else self.runs[shard[0] - 1 :: shard[1]]
-        demonstrations = [item for run in runs for item in run.training.needs]
+        trainings = [run.training for run in runs if run.training]
+        demonstrations = [item for training in trainings for item in training.needs]
         evaluations = [item for run in runs for item in run.evaluations]
-        items = [*demonstrations, *(run.training for run in runs), *evaluations]
+        items = [*demonstrations, *trainings, *evaluations]
         return tuple({item.key: item for item in items}.values())
 
     def video(self, result: EpisodeResult) -> WorkItem:
         """Return the work item that runs the episode of a result once more, for a video."""
         key = result.condition, result.train_seed or 0
         run = next(run for run in self.runs if (run.condition.name, run.train_seed) == key)
-        name = f"{run.training.name}_{result.seed}"
+        name = f"{run.name}_{result.seed}"
         seeds = range(result.seed, result.seed + 1)
-        return self._evaluation("video", name, seeds, run.condition, run.training)
+        needs, files = run.evaluations[0].needs, run.evaluations[0].files
+        return self._evaluation("video", name, seeds, run.condition, needs, files)
 
     def _demonstrations(self, condition: ConditionConfig) -> tuple[WorkItem, ...]:
         variant = condition.expert
@@ -247,23 +259,51 @@ class Plan:
             spec = replace(spec, corruption=replace(spec.corruption, error_stats=STATS))
             files[STATS] = self.error_stats
         config = replace(config, spec=spec)
-        name = f"{condition.name}_seed{train_seed}"
-        training = self._item("training", name, "run_training", {"config": config.to_json()}, files)
+        run = PlannedRun(condition, train_seed, None, ())
+        settings = {"config": config.to_json()}
+        training = self._item("training", run.name, "run_training", settings, files)
         training = replace(training, needs=demonstrations)
-        evaluations = tuple(
-            self._evaluation("evaluation", f"{name}_{seeds.start:06d}", seeds, condition, training)
-            for seeds in _blocks(FIRST_SEED, preset.num_episodes, preset.episode_block)
+        run = replace(run, training=training)
+        return replace(run, evaluations=self._evaluations(run, (training,), training.files))
+
+    def _run_of_checkpoint(self, condition: ConditionConfig) -> PlannedRun:
+        """Plan the evaluation of a policy that is trained already, from copies of its files."""
+        checkpoint = read_checkpoint(condition.checkpoint)
+        mount, names = MOUNTS["training"], (MANIFEST, *ACTING_FILES)
+        files = self._files() | {f"{mount}/{name}": checkpoint.folder / name for name in names}
+        run = PlannedRun(condition, checkpoint.train_seed, None, ())
+        return replace(run, evaluations=self._evaluations(run, (), files))
+
+    def _evaluations(
+        self, run: PlannedRun, needs: tuple[WorkItem, ...], files: Mapping[str, Path]
+    ) -> tuple[WorkItem, ...]:
+        blocks = _blocks(FIRST_SEED, self.preset.num_episodes, self.preset.episode_block)
+        return tuple(
+            self._evaluation(
+                *("evaluation", f"{run.name}_{seeds.start:06d}", seeds, run.condition, needs, files)
+            )
+            for seeds in blocks
         )
-        return PlannedRun(condition, train_seed, training, evaluations)
 
     def _evaluation(
-        self, kind: str, name: str, seeds: range, condition: ConditionConfig, training: WorkItem
+        self,
+        kind: str,
+        name: str,
+        seeds: range,
+        condition: ConditionConfig,
+        needs: tuple[WorkItem, ...],
+        files: Mapping[str, Path],
     ) -> WorkItem:
+        env_kwargs = {"people": self.people.evaluation} if self.people else {}
+        if condition.checkpoint:  # whose demonstrations are not the benchmark's
+            env_kwargs["motion"] = condition.motion
+            if self.library:
+                env_kwargs["motion_library"] = LIBRARY
         config = EvaluationConfig(
             checkpoint=Path(MOUNTS["training"]),
             seeds=seeds,
             out=Path(OUT),
-            env_kwargs={"people": self.people.evaluation} if self.people else {},
+            env_kwargs=env_kwargs,
             num_envs=self.preset.num_envs,
             workers=0,
             device=self.preset.device,
@@ -271,8 +311,8 @@ class Plan:
             videos=int(kind == "video"),
         )
         settings = {"config": config.to_json()}
-        item = self._item(kind, name, "run_evaluation", settings, training.files)
-        return replace(item, needs=(training,), seconds=item.seconds * len(seeds))
+        item = self._item(kind, name, "run_evaluation", settings, files)
+        return replace(item, needs=needs, seconds=item.seconds * len(seeds))
 
     def _item(
         self,
@@ -336,6 +376,8 @@ def make_plan(
             raise RequestError(problem)
     stats = load_error_stats(error_stats)
     for condition in conditions:
+        if condition.checkpoint:  # has statistics of its own
+            continue
         if condition.spec.corruption.error in MEASURED_ERRORS:
             try:
                 stats.require_horizon(condition.spec.horizon)

@@ -70,7 +70,8 @@ class PolicyOptions:
     """Only with --policy.
 
     Attributes:
-        checkpoint: Folder of a training run, or of one of its checkpoints.
+        checkpoint: Folder of a training run, or of one of its checkpoints; or shipped:baseline,
+            shipped:current, shipped:forecast, which come with the package.
         num_envs: Episodes that run at once; results do not depend on it.
         temporal_ensemble: Average the predictions of all chunks, whatever the checkpoint says.
         n_action_steps: Execute so many actions of a chunk before the next, whatever the checkpoint

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +31,8 @@ from robo_manip_baselines.runs.checkpoints import (
     read_manifest,
     verify,
 )
-from robo_manip_baselines.runs.documents import convert, read_json
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.documents import Schema, convert, read_json
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_json
 from robo_manip_baselines.runs.ranges import Amount, NonNegativeInt, Positive, Seed
 from robo_manip_baselines.runs.tensors import read_tensors, require_alike, require_finite
@@ -48,6 +49,18 @@ CONFIG = "config.json"
 STATS = "stats.json"
 TRAINER_TENSORS = "trainer.safetensors"
 TRAINER = "trainer.json"
+ORIGIN = "origin.json"
+
+ACTING_FILES = (MODEL, CONFIG, STATS)
+"""Files that decide a policy's actions; the trainer's state may be deleted."""
+
+SHIPPED = Path(str(files("robo_manip_baselines.policy") / "shipped"))
+"""Folder of the checkpoints that come with the package, each with an ``ORIGIN``."""
+
+SHIPPED_PREFIX = "shipped:"
+"""Before the name of a checkpoint that comes with the package, in place of a folder."""
+
+ORIGIN_SCHEMA = Schema("robo_manip_baselines/checkpoint_origin", 1)
 
 INITIAL_WEIGHTS = "backbone_weights"
 """Setting of a policy that names a file of weights to start from, where it has one."""
@@ -114,15 +127,60 @@ class Checkpoint:
     content_hash: str = ""
 
 
+def shipped_checkpoints() -> list[str]:
+    """Return the names of the checkpoints that come with the package."""
+    return sorted(path.parent.name for path in SHIPPED.glob(f"*/{ORIGIN}"))
+
+
+def locate_checkpoint(path: str | Path) -> Path:
+    """Return the checkpoint folder that a path or ``shipped:NAME`` means.
+
+    Raises:
+        RequestError: there is none.
+    """
+    text = str(path)
+    if not text.startswith(SHIPPED_PREFIX):
+        return find_checkpoint(Path(path))
+    name = text.removeprefix(SHIPPED_PREFIX)
+    return SHIPPED / require_choice("shipped checkpoint", name, shipped_checkpoints())
+
+
+@dataclass(frozen=True)
+class CheckpointOrigin:
+    """Content of ``origin.json``: how a checkpoint that comes with the package was made.
+
+    Attributes:
+        commands: that made it, in order.
+        demonstrations: SHA-256 of the contents of its demonstrations, as in ``config.json``.
+        date: of the last command, ISO 8601.
+        package_version: that made it.
+    """
+
+    commands: tuple[str, ...]
+    demonstrations: str
+    date: str
+    package_version: str
+
+
+def read_origin(checkpoint: Checkpoint) -> CheckpointOrigin:
+    """Read how a shipped checkpoint was made.
+
+    Raises:
+        RequestError: it has no ``origin.json``, or a damaged one.
+    """
+    folder = checkpoint.folder
+    return read_json(verify(folder, read_manifest(folder), ORIGIN), CheckpointOrigin, ORIGIN_SCHEMA)
+
+
 def read_checkpoint(path: str | Path) -> Checkpoint:
-    """Read a checkpoint folder, or the newest checkpoint of a run folder.
+    """Read a checkpoint: its folder, a run folder (the newest one), or ``shipped:NAME``.
 
     Weights, configuration and statistics are verified against their digests.
 
     Raises:
         RequestError: it is missing, damaged, of another kind, or of a newer schema.
     """
-    folder = find_checkpoint(Path(path))
+    folder = locate_checkpoint(path)
     digests = read_manifest(folder)
     verify(folder, digests, MODEL)
     try:
@@ -315,6 +373,6 @@ def _on_cpu(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _content_hash(digests: Mapping[str, str]) -> str:
-    """Digest of the files that decide the policy's actions: the trainer's state may be deleted."""
-    text = "".join(f"{name} {digests[name]}\n" for name in (MODEL, CONFIG, STATS))
+    """Digest of the files that decide the policy's actions."""
+    text = "".join(f"{name} {digests[name]}\n" for name in ACTING_FILES)
     return hashlib.sha256(text.encode()).hexdigest()

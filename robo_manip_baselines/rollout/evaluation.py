@@ -23,6 +23,7 @@ from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.checkpoint import (
+    SHIPPED_PREFIX,
     Checkpoint,
     load_model,
     read_checkpoint,
@@ -71,7 +72,7 @@ class EvaluationConfig:
     """Evaluation of a checkpoint.
 
     Attributes:
-        checkpoint: folder of a training run, or of one of its checkpoints.
+        checkpoint: folder of a training run, or of one of its checkpoints, or ``shipped:NAME``.
         seeds: of the episodes, one each.
         out: folder of the results; ``results/<task>_<run>`` if None.
         env_kwargs: arguments of the environment that differ from those of the demonstrations; held
@@ -424,6 +425,8 @@ def choose_execution(
 
 def run_name(checkpoint: Path) -> str:
     """Name results after the run folder, with the step where one checkpoint of it was named."""
+    if (text := str(checkpoint)).startswith(SHIPPED_PREFIX):
+        return text.replace(":", "_")
     path = checkpoint.resolve()
     if path.parent.name == CHECKPOINTS:
         return f"{path.parent.parent.name}_{path.name}"

@@ -284,8 +284,9 @@ def test_help_names_the_options_and_an_example() -> None:
 
 def test_the_conditions_ship_with_the_package() -> None:
     assert {path.name for path in CONDITIONS.glob("*.yaml")} == {
-        "feeding.yaml",
         "delay.yaml",
+        "demo.yaml",
+        "feeding.yaml",
         "foresight_policies.yaml",
     }
 

@@ -22,9 +22,13 @@ from robo_manip_baselines.benchmark.conditions import (
     read_conditions,
 )
 from robo_manip_baselines.benchmark.plan import PRESETS, BenchmarkPreset, Plan, make_plan
+from robo_manip_baselines.benchmark.work_item import ArtifactStore
+from robo_manip_baselines.benchmark.worker import run_evaluation
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS
-from robo_manip_baselines.rollout.results import EpisodeResult
+from robo_manip_baselines.policy.checkpoint import SHIPPED, read_checkpoint
+from robo_manip_baselines.rollout.results import EpisodeResult, read_results
 from robo_manip_baselines.runs.errors import RequestError
 
 PRESET = BenchmarkPreset(
@@ -266,3 +270,101 @@ def test_a_video_acts_one_episode_of_a_training_out() -> None:
         "seeds": [1004, 1005],
         "videos": 1,
     }
+
+
+DEMO = read_conditions(CONDITIONS / "demo.yaml")
+
+
+def trained(name: str = "shipped", **values: object) -> ConditionConfig:
+    """A condition whose policy is trained already."""
+    return ConditionConfig.from_yaml({"name": name, "checkpoint": "shipped:current", **values})
+
+
+def test_the_demo_only_evaluates_and_on_motion_of_other_people() -> None:
+    size = replace(PRESETS["cpu"], num_episodes=20)
+    made = make_plan(DEMO.env, DEMO.conditions, size, people=DEMO.people, headline=DEMO.headline)
+    assert [item.kind for item in made.items()] == ["evaluation"] * 3
+    assert [run.training for run in made.runs] == [None] * 3
+    for run in made.runs:
+        (item,) = run.evaluations
+        config = item.settings["config"]
+        assert config["env_kwargs"] == {"people": "test", "motion": "dyskinetic"}
+        assert (config["checkpoint"], config["seeds"]) == ("run", [1000, 1020])
+        assert item.needs == ()
+        assert {path.parent.name for path in item.files.values()} == {
+            run.condition.checkpoint.removeprefix("shipped:")
+        }
+    assert [run.condition.spec.corruption.delay for run in made.runs] == [0, 4, 4]
+    assert DEMO.headline == "success_strict"
+
+
+def test_a_trained_policy_stands_beside_one_that_is_trained() -> None:
+    made = plan(CURRENT, trained())
+    kinds = [item.kind for item in made.items()]
+    assert {kind: kinds.count(kind) for kind in kinds} == {
+        "demonstrations": 2,
+        "training": 1,
+        "evaluation": 4,
+    }
+    # Work of earlier benchmarks keeps its keys.
+    assert keys(made, "evaluation")[:2] == keys(plan(CURRENT), "evaluation")
+    assert made.items((2, 2)) == made.runs[1].evaluations
+    result = EpisodeResult("FeedingEnv", 1004, True, True, 4.0, 600, "", "c", "p")
+    video = made.video(replace(result, condition="shipped", train_seed=0))
+    assert video.files == made.runs[1].evaluations[0].files
+    assert video.name == "shipped_seed0_1004"
+
+
+def test_other_weights_make_another_item(tmp_path: Path) -> None:
+    source = SHIPPED / "current"
+    shutil.copytree(source, tmp_path / "copy")
+    same = plan(trained(checkpoint=str(tmp_path / "copy")))
+    assert keys(same, "evaluation") == keys(plan(trained()), "evaluation")
+    other = plan(trained(checkpoint="shipped:baseline"))
+    assert not {*keys(other, "evaluation")} & {*keys(same, "evaluation")}
+    assert keys(plan(trained(motion="sway")), "evaluation") != keys(same, "evaluation")
+
+
+def test_the_motion_of_a_trained_policy_is_that_of_its_demonstrations() -> None:
+    assert trained().motion == "dyskinetic"
+    assert trained(motion="recorded").motion == "recorded"
+    assert trained().spec == read_checkpoint("shipped:current").spec
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"obs": "current"}, "'obs' is what a policy is trained with.*name, checkpoint, motion"),
+        ({"policy": "Act"}, "'policy' is what"),
+        ({"delay": 3}, "'delay' is what"),
+        ({"checkpoint": "shipped:curent"}, "did you mean 'current'"),
+        ({"checkpoint": "no/where"}, "checkpoint 'no/where' does not exist"),
+        ({"checkpoint": 3}, "checkpoint: must be text"),
+        ({"motion": "swai"}, "did you mean 'sway'"),
+    ],
+)
+def test_what_does_not_go_with_a_checkpoint_is_refused(
+    values: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(RequestError, match=message):
+        trained(**values)
+
+
+def test_a_checkpoint_is_of_one_task_and_not_of_the_paper() -> None:
+    with pytest.raises(RequestError, match="of the paper"):
+        plan(trained(name="current", motion="recorded"))
+    other = replace(task_entry("FeedingEnv"), name="OtherEnv")
+    with pytest.raises(RequestError, match="was trained in FeedingEnv, not in OtherEnv"):
+        trained().for_task(other)
+
+
+@pytest.mark.long
+def test_the_item_of_a_trained_policy_acts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (item,) = plan(trained(), preset=replace(PRESET, num_episodes=1)).items()
+    folder = ArtifactStore(tmp_path).prepare(item)
+    settings = json.loads(json.dumps(item.settings))
+    settings["config"]["env_kwargs"]["max_episode_steps"] = 20
+    monkeypatch.chdir(folder)
+    run_evaluation(settings)
+    (result,) = read_results(folder / "out")
+    assert result.checkpoint == read_checkpoint("shipped:current").content_hash

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from robo_manip_baselines.benchmark.aggregation import closing_summary
 from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow
 from robo_manip_baselines.benchmark.tables.benchmark import (
@@ -313,3 +314,24 @@ def test_a_task_without_a_study(make_rows: Callable[..., tuple[ResultRow, ...]])
     assert len(tables["success"].columns) == 6
     assert len(tables["failures"].columns) == 3
     assert "aper" not in "".join(map(to_markdown, tables.values()))
+
+
+def test_the_closing_table_has_both_rates_and_the_force(
+    rows: tuple[ResultRow, ...], statistics: BenchmarkStatistics
+) -> None:
+    pushed = tuple(
+        replace(row, result=replace(row.result, columns={**row.result.columns, "face_force": f}))
+        for row, f in zip(rows, [1.0, 4.0] * (len(rows) // 2), strict=True)
+    )
+    strict = analyze(pushed, task=statistics.task, resamples=50, headline="success_strict")
+    for given, first, second in (
+        (strict, "strict success", "success"),
+        (analyze(pushed, task=statistics.task, resamples=50), "success", "strict success"),
+    ):
+        lines = closing_summary(given, Path("out")).splitlines()
+        for c, line in zip(given.conditions, lines, strict=False):
+            rates = {"success": c.success, "strict success": c.strict}
+            assert line.startswith(c.condition.label)
+            assert f"200 episodes, {first} {rates[first]}, {second} " in line
+            assert line.endswith(f"{second} {rates[second].rate:.1%}, mean face force 2.5 N")
+        assert lines[-1].split() == ["report", "out/report.html"]

@@ -200,7 +200,7 @@ def test_other_folders_are_refused(run: Path, tmp_path: Path) -> None:
     [
         (lambda c: c.update(policy="Gpt"), "unknown policy 'Gpt'"),
         (lambda c: c["config"].update(width=3), "width"),
-        (lambda c: c["spec"].update(horizon=9), "horizon 9: must be 5 or less"),
+        (lambda c: c["spec"].update(horizon=25), "horizon 25: must be 24 or less"),
         (lambda c: c.pop("acting"), "acting: is missing"),
         (lambda c: c.update(acting=[1]), "acting: must be an object, not a list of 1"),
         (lambda c: c["acting"].update(execute=0), "n_action_steps 0: must be 1 or more"),

@@ -22,6 +22,7 @@ OF_TORCH = (
     "face_prediction.models",
     "face_prediction.training",
     "robo_manip_baselines.policy.act",
+    "robo_manip_baselines.policy.cuda_graph",
     "robo_manip_baselines.policy.execution",
     "robo_manip_baselines.policy.interface",
     "robo_manip_baselines.policy.mlp",

@@ -11,7 +11,13 @@ MAX_FILE_BYTES = 2_000_000  # data beyond that belongs in a release, not in ever
 MAX_SCRIPT_LINES = 40
 # Footage and photographs of people, and other people's model files, are not ours to publish.
 FOOTAGE = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif", ".jpg", ".jpeg", ".heic", ".webp"}
-OURS = {"face_prediction/assets/residual/model.safetensors"}  # docs/predictors.md says of whom
+OURS = {
+    "face_prediction/assets/residual/model.safetensors",  # docs/predictors.md says of whom
+    *(  # docs/training.md says of what
+        f"robo_manip_baselines/policy/shipped/{name}/model.safetensors"
+        for name in ("baseline", "current", "forecast")
+    ),
+}
 MODELS = {".task", ".tflite", ".pt", ".pth", ".onnx", ".safetensors"}
 
 

@@ -34,7 +34,7 @@ from robo_manip_baselines.rollout.demonstrate import (
     replay,
 )
 from robo_manip_baselines.rollout.videos import (
-    PLAIN,
+    PREVIEW_SIZE,
     preview_frames,
     side_by_side,
     write_preview,
@@ -155,9 +155,11 @@ def test_the_preview_is_the_episode(cameras: str, tmp_path: Path) -> None:
         write_preview(tmp_path / name, episodes)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
     frames = list(preview_frames(episodes[0]))
-    assert {frame.shape for frame in frames} == {(360, 3 * 480, 3)}
+    height, width = PREVIEW_SIZE
+    assert {frame.shape for frame in frames} == {(height, 3 * width, 3)}
     assert len(frames) == 6
-    with EpisodeReader(episodes[0]) as episode, closing(remake_env(episode, **PLAIN)) as env:
+    changes = {"image_size": PREVIEW_SIZE, "render_size": None}
+    with EpisodeReader(episodes[0]) as episode, closing(remake_env(episode, **changes)) as env:
         for step in replay(env, episode):
             if step % 2 == 0:
                 views = world_of(env).renderer.render(world_of(env).data, CAMERAS)

@@ -11,6 +11,7 @@ import pytest
 from robo_manip_baselines.rollout.videos import (
     YELLOW,
     VideoWriter,
+    _paint,
     draw_track,
     pad_to_even,
     put_caption,
@@ -167,3 +168,20 @@ def test_caption_stays_in_the_lower_left(text: str) -> None:
     assert not (drawn[:, -1] != GREY[:, -1]).any()  # nothing is cut off at the right
     assert drawn.max() > 200  # white letters
     assert drawn.min() < 30  # with a dark rim
+
+
+@pytest.mark.parametrize("size", [(60, 80), (1, 1), (7, 5)])
+def test_paint_is_a_mixture_pixel_by_pixel(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+    for opacity in (
+        np.where(rng.random(size) < 0.3, rng.integers(0, 256, size), 0).astype(np.uint8),
+        np.zeros(size, np.uint8),
+        np.full(size, 255, np.uint8),
+    ):
+        before, weight = image.copy(), opacity[..., None] / 255
+        wanted = image * (1 - weight) + np.array(YELLOW) * weight
+        painted = _paint(image, opacity, YELLOW)
+        np.testing.assert_array_equal(image, before)
+        assert np.abs(painted - wanted).max() <= 0.5 + 1e-4  # rounded from float32
+        np.testing.assert_array_equal(painted[opacity == 0], image[opacity == 0])

@@ -512,6 +512,17 @@ def times_beside_paper(statistics: BenchmarkStatistics) -> Table:
     return condition_table("completion_times_beside_paper", title, conditions, columns, notes)
 
 
+def mean_and_p90(
+    condition: ConditionStatistics, column: ResultColumn
+) -> tuple[float | None, float | None]:
+    """Return mean and 90th percentile of a column of numbers; None where no row has one."""
+    found = [row.result.columns.get(column.name) for row in condition.rows]
+    numbers = [value for value in found if value is not None]
+    if not numbers:
+        return None, None
+    return float(np.mean(numbers)), float(np.percentile(numbers, 90.0))
+
+
 def measures_table(statistics: BenchmarkStatistics) -> Table:
     """Make the table of the task's columns that are end points; without rows where none has any."""
     shown = [column for column in statistics.task.columns if column.in_tables]
@@ -521,11 +532,7 @@ def measures_table(statistics: BenchmarkStatistics) -> Table:
 
     def measure(column: ResultColumn) -> Statistic:
         def values(c: ConditionStatistics) -> tuple[float | None, float | None]:
-            found = [row.result.columns.get(column.name) for row in c.rows]
-            numbers = [value for value in found if value is not None]
-            if not numbers:
-                return None, None
-            return float(np.mean(numbers)), float(np.percentile(numbers, 90.0))
+            return mean_and_p90(c, column)
 
         name = column.name
         title = title_of(column) + (f", {column.unit}" if column.unit else "")
