@@ -59,7 +59,7 @@ def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> No
     cells: dict[tuple[str, int], list[str]] = {}
     for c in grid:
         spec, corruption = c.spec, c.spec.corruption
-        assert spec.relative
+        assert spec.relative == (spec.obs != "current")
         shown = spec.obs
         if spec.obs == "current_pred":
             is_model = corruption.error == "model"
