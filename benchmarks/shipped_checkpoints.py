@@ -52,7 +52,7 @@ NETWORK = {"preset": "cpu", "use_cvae": False, "feedforward_size": 256, "seed": 
 POLICIES: dict[str, dict[str, Any]] = {
     "baseline": {"obs": "baseline"},
     "current": {"obs": "current", "delay": 4},
-    "forecast": {"obs": "current_pred", "horizon": 12, "relative": True, "delay": 4},
+    "forecast": {"obs": "current_pred", "horizon": 16, "relative": True, "delay": 4},
 }
 """Name of a shipped checkpoint -> its options of ``bin/Train.py Act`` beside ``NETWORK``."""
 
