@@ -68,8 +68,7 @@ def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> No
         cell = c.motion, corruption.delay
         cells.setdefault(cell, []).append(shown)
         assert c.name == f"{c.motion}_delay{corruption.delay}_{shown}"
-    shown_of_each = ["current", "history", "truth", "persistence"]
-    shown_of_each += ["autoregression", "direct_autoregression"]
+    shown_of_each = ["current", "history", "truth", "persistence", "autoregression"]
     assert cells == {
         (motion, delay): shown_of_each + ["residual"] * (motion == "recorded")
         for motion in ("dyskinetic", "sway", "recorded")

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 FORECASTERS = (
     *("truth", "persistence", "constant_velocity", "autoregression", "kalman", "residual"),
-    *("shuffled", "direct_autoregression"),
+    "shuffled",
 )
 """Names of the forecasters."""
 

@@ -236,7 +236,11 @@ def draw_surface(figure: Any, statistics: ForesightStatistics) -> None:
     scale: Any = ScalarMappable(Normalize(0.0, 100.0), "cividis")
     for execution, line in zip(executions, panels, strict=True):
         for motion, axes in zip(motions, line, strict=True):
-            for found in _of(statistics, motion, execution):
+            cells = _of(statistics, motion, execution)
+            if not cells:
+                axes.set_axis_off()
+                continue
+            for found in cells:
                 delay, lead = delays.index(found.cell.delay), found.cell.lead
                 percent = 100.0 * (found.strict.rate or 0.0)
                 place: Any = ((lead - 1.4, delay - 0.44), 2.8, 0.88)
@@ -275,6 +279,9 @@ def draw_tracking(figure: Any, statistics: ForesightStatistics) -> None:
     for execution, line in zip(executions, panels, strict=True):
         for motion, axes in zip(motions, line, strict=True):
             cells = _of(statistics, motion, execution)
+            if not cells:
+                axes.set_axis_off()
+                continue
             for delay in sorted({found.cell.delay for found in cells}):
                 expected = expected_lead(delay, execution)
                 points = [
@@ -289,8 +296,7 @@ def draw_tracking(figure: Any, statistics: ForesightStatistics) -> None:
             axes.set_title(f"{motion}, {EXECUTION_TITLES[execution]}", fontsize=10)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.grid(axis="y")
-            if cells:
-                axes.legend(fontsize=8)
+            axes.legend(fontsize=8)
     for axes in panels[:, 0]:  # they share their limits with those of their row
         axes.set_ylim(bottom=0.0)
     figure.supxlabel("lead minus the expected lead, frames of 1/30 s", fontsize=10)

@@ -30,7 +30,7 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
 from robo_manip_baselines.envs.mujoco.face.motions import FaceMotion, parse_motion
 from robo_manip_baselines.envs.mujoco.face.replay import FRAMES_AHEAD
 from robo_manip_baselines.observation import FORECASTERS, FRAME_PERIOD, MAX_HORIZON
-from robo_manip_baselines.runs.autoregression import RIDGE, forecast, moments, solve
+from robo_manip_baselines.runs.autoregression import forecast, moments, solve
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.seeds import derive_seed
 
@@ -135,17 +135,8 @@ def autoregression(coefficients: Floats) -> LinearForecaster:
     # The response to a displacement of 1 m, k frames ago, along each axis.
     unit = np.eye(3 * order).reshape(order, 3, order, 3)[:, :, ::-1]
     moved = forecast(coefficients, unit.reshape(3 * order, order, 3), MAX_LEAD).cumsum(axis=1)
-    return _of_displacements(moved.reshape(order, 3, MAX_LEAD, 3).transpose(2, 0, 3, 1))
-
-
-def _of_displacements(response: Floats) -> LinearForecaster:
-    """Return the forecaster that is linear in displacements, the differences of two frames.
-
-    Args:
-        response: (H, P, 3, 3), how far the mouth moves until h frames ahead, h from 1 on, for a
-            displacement k frames ago.
-    """
-    weights = np.zeros((response.shape[0] + 1, response.shape[1] + 1, 3, 3))
+    response = moved.reshape(order, 3, MAX_LEAD, 3).transpose(2, 0, 3, 1)
+    weights = np.zeros((MAX_LEAD + 1, order + 1, 3, 3))
     weights[1:, :-1] = response
     weights[1:, 1:] -= response
     weights[:, 0] += np.eye(3)
@@ -194,27 +185,6 @@ def fit_autoregression(paths: Floats) -> LinearForecaster:
     # Rounded, so that the number of threads of BLAS, which sums in another order, changes nothing.
     made = [autoregression(solve(sums, order, 3).round(6)) for order in ORDERS]
     return min(made, key=lambda forecaster: forecaster.error(held_out, FIT_HORIZON))
-
-
-def fit_direct_autoregression(tracks: Floats, order: int = max(ORDERS)) -> LinearForecaster:
-    """Fit a regression of its own for each horizon on displacements, of tracks (E, T, K, 3) m.
-
-    An autoregression that is iterated, as by `fit_autoregression`, enlarges its errors with every
-    frame, and what it knows of frames does not hold between them. This one is fitted to the
-    displacements that are seen at control steps, and minimises the error at each horizon.
-    """
-    size = 3 * order
-    cross, target = np.zeros((size, size)), np.zeros((size, 3 * MAX_LEAD))
-    for track in tracks:
-        seen = frames_seen(track, order + 1)
-        moved = (seen[:, :-1] - seen[:, 1:]).reshape(-1, size)
-        ahead = (track[:, 1:] - track[:, :1]).reshape(-1, 3 * MAX_LEAD)
-        cross += moved.T @ moved
-        target += moved.T @ ahead
-    ridge = RIDGE * max(np.trace(cross) / size, np.finfo(float).tiny)
-    # Rounded for the same reason as above.
-    solved = np.linalg.solve(cross + ridge * np.eye(size), target).round(6)
-    return _of_displacements(solved.reshape(order, 3, MAX_LEAD, 3).transpose(2, 0, 3, 1))
 
 
 def fit_kalman(paths: Floats) -> LinearForecaster:
@@ -284,11 +254,9 @@ class MotionForecasters:
 
     def paths(self) -> Floats:
         """Draw the displacement of the mouth in episodes to fit to, (E, T, 3) m, in frames."""
-        return self._fit_to(np.arange(round(SEGMENT_DURATION / FRAME_PERIOD)) * FRAME_PERIOD)
-
-    def tracks(self) -> Floats:
-        """Draw the same at control steps, (E, T, K, 3) m: now and in the frames to come."""
-        return self._fit_to(_step_times(round(SEGMENT_DURATION / CONTROL_PERIOD)) + FRAMES_AHEAD)
+        time = np.arange(round(SEGMENT_DURATION / FRAME_PERIOD)) * FRAME_PERIOD
+        drawn = [self._draw(derive_seed(0, "fit", n)) for n in range(FIT_EPISODES)]
+        return np.stack([segment.displacement_at(time) for segment in drawn])
 
     def another_episode(self, seed: int) -> MotionSegment:
         """Draw the motion of another episode than the one of ``seed``, for ``shuffled``."""
@@ -298,7 +266,8 @@ class MotionForecasters:
         """Return the forecasts, (T, H, 3) m, made at each control step of an episode.
 
         They are made of the mouth until then: the same whether ``track`` is of an environment or of
-        an episode file, and up to any step the same whatever follows.
+        an episode file, and up to any step the same whatever follows. Until as many frames have
+        been seen as a forecaster uses, the mouth is forecast to stay where it is.
 
         Args:
             name: one of ``FORECASTERS``.
@@ -318,12 +287,11 @@ class MotionForecasters:
             seen = frames_seen(track, weights.shape[1])
             # Summed by NumPy itself in a fixed order: BLAS rounds otherwise for another T.
             made = np.einsum("hnij,tnj->thi", weights[1:], seen)
+            # A mouth that seems to start at once is no motion that anything was fitted to.
+            is_early = _step_times(len(track))[:, 0] < (weights.shape[1] - 1) * FRAME_PERIOD - 1e-6
+            made[is_early] = track[is_early, :1]
         # The face stands still after its motion, and so does the forecast.
         return made[np.minimum(np.arange(len(track)), round(SEGMENT_DURATION / CONTROL_PERIOD))]
-
-    def _fit_to(self, time: ArrayLike) -> Floats:
-        drawn = [self._draw(derive_seed(0, "fit", n)) for n in range(FIT_EPISODES)]
-        return np.stack([segment.displacement_at(time) for segment in drawn])
 
     def _draw(self, seed: int) -> MotionSegment:
         rng = np.random.default_rng(seed)
@@ -334,7 +302,6 @@ LINEAR: Mapping[str, Callable[[MotionForecasters], LinearForecaster]] = {
     "persistence": lambda _: persistence(),
     "constant_velocity": lambda _: constant_velocity(),
     "autoregression": lambda made: fit_autoregression(made.paths()),
-    "direct_autoregression": lambda made: fit_direct_autoregression(made.tracks()),
     "kalman": lambda made: fit_kalman(made.paths()),
 }
 """Name of a linear forecaster -> what makes it for a motion."""
