@@ -224,7 +224,7 @@ def test_facts_of_the_study(statistics: BenchmarkStatistics) -> None:
         "Episodes": "3200 of 16 conditions",
         "Training runs": "2 of each condition (seeds 0, 1)",
         "Evaluation seeds": "100 that all conditions have, from 1000 to 1099",
-        "Recorded motion": "7 clips of 5 people",
+        "Motion": "recorded, 7 clips of 5 people",
         "Versions": "numpy 2",
     }
 

@@ -18,7 +18,9 @@ from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatisti
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, RowSelection
 from robo_manip_baselines.benchmark.tables.benchmark import benchmark_tables
 from robo_manip_baselines.benchmark.tables.table import Table
+from robo_manip_baselines.envs.mujoco.face.motions import SYNTHETIC
 from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn
+from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import write_text
@@ -235,14 +237,23 @@ def general_facts(statistics: BenchmarkStatistics) -> dict[str, str]:
         "Training runs": _training_runs(statistics.train_seeds),
         "Evaluation seeds": f"{len(seeds)} that all conditions have"
         + (f", from {seeds[0]} to {seeds[-1]}" if seeds else ""),
-        "Recorded motion": f"{len({r.motion_clip for r in results})} clips of "
-        f"{len({r.motion_subject for r in results})} people",
+        "Motion": _motion(results),
     }
     if versions:
         facts["Versions"] = ", ".join(
             f"{name} {' and '.join(sorted(found))}" for name, found in sorted(versions.items())
         )
     return facts
+
+
+def _motion(results: Sequence[EpisodeResult]) -> str:
+    """Describe the motions by name, and the recordings where there are any."""
+    recorded = [r for r in results if r.motion_clip != SYNTHETIC]
+    parts = sorted({r.motion for r in results})
+    if recorded:
+        people = len({r.motion_subject for r in recorded})
+        parts.append(f"{len({r.motion_clip for r in recorded})} clips of {people} people")
+    return ", ".join(parts)
 
 
 def _training_runs(seeds: Sequence[int | None]) -> str:
