@@ -228,7 +228,7 @@ def test_the_shipped_benchmarks_can_be_planned() -> None:
     )
     assert {
         kind: len(keys(made, kind)) for kind in ("demonstrations", "training", "evaluation")
-    } == {"demonstrations": 6, "training": 39, "evaluation": 78}
+    } == {"demonstrations": 6, "training": 33, "evaluation": 66}
 
 
 @pytest.mark.parametrize(
