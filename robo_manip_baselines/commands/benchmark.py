@@ -67,9 +67,9 @@ class BenchmarkOptions:
     """Options of a benchmark.
 
     Attributes:
-        benchmark: Name of the benchmark: feeding, delay; demo, of the checkpoints that come with
-            the package, without training; or foresight, a study without policies that has options
-            of its own (foresight --help).
+        benchmark: Name of the benchmark: feeding, delay, foresight_policies; demo, of the
+            checkpoints that come with the package, without training; or foresight, a study without
+            policies that has options of its own (foresight --help).
         preset: Size: cpu (without images), paper (three cameras, a GPU) or smoke (three minutes).
         conditions: Names of conditions, with spaces or commas between them; those of the preset if
             not given.
