@@ -37,7 +37,11 @@ from robo_manip_baselines.data.normalization import StoredNormalization
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, StoredErrorStats
 from robo_manip_baselines.policy.act.config import ActConfig
-from robo_manip_baselines.policy.checkpoint import CheckpointDocument, TrainerDocument
+from robo_manip_baselines.policy.checkpoint import (
+    CheckpointDocument,
+    CheckpointOrigin,
+    TrainerDocument,
+)
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.presets import ActionExecution, TrainSettings
 from robo_manip_baselines.rollout.results import row_type
@@ -63,7 +67,7 @@ KINDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
         *(ActConfig, ActionExecution, ApproachSettings, CheckpointDocument, CheckpointManifest),
-        *(CheckpointRecord, ConditionConfig, ConditionsDocument, Corruption),
+        *(CheckpointOrigin, CheckpointRecord, ConditionConfig, ConditionsDocument, Corruption),
         *(CrossAttentionSettings, FusionSettings, ItemManifest, ManifestDocument, MetricsLine),
         *(MlpConfig, ObservationSpec, PredictorErrorStats, ResidualSettings, SequenceSettings),
         *(Split, StoredErrorStats, StoredNormalization, StoredTrainer, TrainSettings),

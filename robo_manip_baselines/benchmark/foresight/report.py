@@ -55,9 +55,7 @@ EXECUTION_TITLES = {
     "ensemble": f"chunks of {CHUNK_SIZE}, ensemble",
 }
 
-FORECASTER_COLORS = dict(
-    zip(FORECASTERS, (INK, GREY, ORANGE, BLUE, GREEN, PINK, RED, SKY), strict=True)
-)
+FORECASTER_COLORS = dict(zip(FORECASTERS, (INK, GREY, ORANGE, BLUE, GREEN, PINK, RED), strict=True))
 
 
 # -- tables ---------------------------------------------------------------------------------------
