@@ -27,7 +27,7 @@ from robo_manip_baselines.rollout.demonstrate import Collection
 from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.checkpoints import MANIFEST
-from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.ranges import Amount, Count, Episodes, require_ranges
 from robo_manip_baselines.training.config import BUDGET_OPTIONS, TrainConfig
 
@@ -360,14 +360,9 @@ def make_plan(
 
     Raises:
         RequestError: a file cannot be used, a condition needs predictions that the library lacks or
-            errors further ahead than the statistics go, its people cannot be split, or no policy
-            has a setting.
+            errors further ahead than the statistics go, or its people cannot be split.
     """
     motion = MotionLibrary.load(library)
-    policies = {condition.policy for condition in conditions}
-    known = [TrainConfig.from_preset(policy, preset.train_preset).to_json() for policy in policies]
-    for name in preset.train_settings:
-        require_choice("training setting", name, sorted(set().union(*known)))
     for condition in conditions:
         if parse_motion(condition.motion).recorded:
             for part in (people.demonstrations, people.evaluation):

@@ -50,6 +50,7 @@ from robo_manip_baselines.runs.files import prepare_folder, require_out_folder
 from robo_manip_baselines.runs.progress import closing_table, duration
 from robo_manip_baselines.runs.ranges import Episodes, require_ranges
 from robo_manip_baselines.runs.versions import source_digest
+from robo_manip_baselines.training.config import TrainConfig
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
 DESCRIPTION = """Train every condition of a benchmark, evaluate all of them on common seeds, and
@@ -241,16 +242,23 @@ def plan_of(options: BenchmarkOptions) -> Plan:
     file = read_conditions(path)
     for preset in file.presets:
         require_choice(f"preset in '{path}'", preset, PRESETS)
-    given = tuple(name for part in options.conditions for name in part.split(",") if name)
+    named = tuple(name for part in options.conditions for name in part.split(",") if name)
     conditions = file.conditions
-    if names := given or file.presets.get(options.preset):
-        conditions = file.choose(names)
+    if chosen := named or file.presets.get(options.preset):
+        conditions = file.choose(chosen)
     elif not options.conditions_file:
         library = MotionLibrary.load(options.motion_library)
         problems = {c.name: missing_predictions(c, library) for c in conditions}
         for problem in filter(None, problems.values()):
             logger.warning("left out: %s", problem)
         conditions = tuple(c for c in conditions if not problems[c.name])
+    if given := parse_settings(options.train_settings, "--train_settings"):
+        # A policy takes those that it has: at least one must have each.
+        preset = options.size.train_preset
+        known = [TrainConfig.from_preset(c.policy, preset, file.env) for c in conditions]
+        names = set().union(*(config.to_json() for config in known))
+        for name in given:
+            require_choice("training setting", name, sorted(names))
     return make_plan(
         file.env,
         conditions,
