@@ -33,6 +33,9 @@ from robo_manip_baselines.policy.checkpoint import (
     CheckpointOrigin,
     read_checkpoint,
 )
+from robo_manip_baselines.policy.checkpoint import (
+    CONFIG as CONFIG_FILE,
+)
 from robo_manip_baselines.rollout.demonstrate import SUMMARY
 from robo_manip_baselines.runs.checkpoints import checkpoint_folder
 from robo_manip_baselines.runs.command import parse, run_command
@@ -180,6 +183,10 @@ def ship(run: Path, folder: Path) -> Checkpoint:
     with checkpoint_folder(folder) as temporary:
         for name in ACTING_FILES:
             shutil.copyfile(checkpoint.folder / name, temporary / name)
+        # The place of the demonstrations on this machine means nothing elsewhere.
+        content = read_json(temporary / CONFIG_FILE, dict[str, Any])
+        content["dataset"]["folder"] = Path(content["dataset"].get("folder", "")).name
+        write_json(temporary / CONFIG_FILE, content)
         write_json(temporary / ORIGIN, {**ORIGIN_SCHEMA.to_json(), **dataclasses.asdict(origin)})
     return read_checkpoint(folder)
 

@@ -68,6 +68,7 @@ def test_its_origin_makes_it_again(name: str, maker: ModuleType) -> None:
     checkpoint = read_checkpoint(f"shipped:{name}")
     origin = read_origin(checkpoint)
     assert origin.demonstrations == checkpoint.dataset.get("content_hash")
+    assert "/" not in checkpoint.dataset.get("folder", "")  # no place on the machine that made it
     assert origin.package_version == checkpoint.versions["robo_manip_baselines"]
     assert date.fromisoformat(origin.date) >= date(2025, 1, 1)
     recording, training = map(shlex.split, origin.commands)
