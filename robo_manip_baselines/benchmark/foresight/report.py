@@ -27,7 +27,7 @@ from robo_manip_baselines.benchmark.report.figures import (
     PINK,
     RED,
     SKY,
-    STYLE,
+    styled_figure,
 )
 from robo_manip_baselines.benchmark.statistics.inference import Estimate
 from robo_manip_baselines.benchmark.tables.table import (
@@ -42,8 +42,6 @@ from robo_manip_baselines.benchmark.tables.table import (
 from robo_manip_baselines.envs.mujoco.expert.servo import ARM_LAG
 from robo_manip_baselines.envs.mujoco.face.forecasters import MAX_LEAD
 from robo_manip_baselines.rollout.results import Proportion
-from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import atomic_file, write_text
 
 PAGE = "README.md"
@@ -363,18 +361,8 @@ def write_figures(folder: Path, statistics: ForesightStatistics) -> None:
     Raises:
         RequestError: matplotlib is not installed.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise RequestError(
-            f"figures need matplotlib ({error}); run: {install_command('train')}"
-        ) from None
     for item in FIGURE_LIST:
-        with mpl.rc_context(STYLE):
-            figure = Figure(layout="constrained", facecolor="#ffffff")
-            FigureCanvasAgg(figure)
+        with styled_figure("agg", "#ffffff") as figure:
             item.draw(figure, statistics)
             with atomic_file(folder / f"{item.name}.png") as temporary:
                 figure.savefig(temporary, format="png", dpi=120, metadata={"Software": None})

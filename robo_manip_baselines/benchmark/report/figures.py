@@ -5,10 +5,12 @@ Matplotlib is imported where something is drawn.
 
 from __future__ import annotations
 
+import importlib
 import io
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -107,6 +109,35 @@ Draw = Callable[[Any, BenchmarkStatistics], tuple[str, str]]
 """Draws statistics into an empty Matplotlib figure; returns caption and summary."""
 
 
+@contextmanager
+def styled_figure(
+    backend: str, background: str, style: Mapping[str, str] | None = None
+) -> Iterator[Any]:
+    """Yield an empty Matplotlib figure in the style of reports, to be drawn and saved in the block.
+
+    Args:
+        backend: of Matplotlib: ``agg`` or ``svg``.
+        background: color.
+        style: further settings of Matplotlib.
+
+    Raises:
+        RequestError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+
+        canvas = importlib.import_module(f"matplotlib.backends.backend_{backend}").FigureCanvas
+    except ImportError as error:
+        raise RequestError(
+            f"figures need matplotlib ({error}); run: {install_command('train')}"
+        ) from None
+    with mpl.rc_context(STYLE | dict(style or {})):
+        figure = Figure(layout="constrained", facecolor=background)
+        canvas(figure)
+        yield figure
+
+
 def render_figure(
     name: str, title: str, draw: Draw, statistics: BenchmarkStatistics
 ) -> ReportFigure:
@@ -121,18 +152,8 @@ def render_figure(
     Raises:
         RequestError: matplotlib is not installed.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.backends.backend_svg import FigureCanvasSVG
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise RequestError(
-            f"figures need matplotlib ({error}); run: {install_command('train')}"
-        ) from None
     stream = io.StringIO()
-    with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
-        figure = Figure(layout="constrained", facecolor="none")
-        FigureCanvasSVG(figure)
+    with styled_figure("svg", "none", {"svg.hashsalt": name}) as figure:
         caption, summary = draw(figure, statistics)
         figure.savefig(stream, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     return ReportFigure(name, title, caption, summary, stream.getvalue())
