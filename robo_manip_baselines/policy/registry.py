@@ -34,7 +34,8 @@ class PolicyEntry:
         presets: ``module:name`` of a dict: preset -> ``PolicyPreset``, the first of which is the
             default where none fits the machine.
         normalization: of its states and actions: ``mean_std``, ``min_max`` (to [-1, 1]),
-            ``action_min_max`` (that of actions alone), ``none``, or ``module:function`` of its own; see `data.normalization`.
+            ``action_min_max`` (that of actions alone), ``none``, or ``module:function`` of its own;
+            see `data.normalization`. Training's option ``norm`` goes before it.
     """
 
     config: str

@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar
 
 import tyro
 
+from robo_manip_baselines.data.normalization import METHODS
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.spec import parse_image_size, size_text
@@ -22,7 +23,7 @@ from robo_manip_baselines.policy.presets import (
     ActionExecution,
     TrainSettings,
 )
-from robo_manip_baselines.policy.registry import policy_presets
+from robo_manip_baselines.policy.registry import policy_entry, policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.documents import as_json, convert, read_yaml
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -101,6 +102,14 @@ class TrainConfig(Generic[Network]):
         require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
         task_entry(self.env)
         require_ranges(self)
+        if self.training.norm is not None:
+            own = policy_entry(self.policy).normalization
+            require_choice("norm", self.training.norm, dict.fromkeys([*METHODS, own]))
+
+    @property
+    def norm(self) -> str:
+        """Normalisation of states and actions, the policy's own where none is given."""
+        return self.training.norm or policy_entry(self.policy).normalization
 
     @classmethod
     def from_preset(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from robo_manip_baselines.data.demonstrations import (
@@ -23,7 +25,7 @@ from robo_manip_baselines.policy.checkpoint import (
     without_initial_weights,
 )
 from robo_manip_baselines.policy.interface import PolicyDims, PolicyModel
-from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry, require_memory
+from robo_manip_baselines.policy.registry import load_part, make_model, require_memory
 from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import (
@@ -83,8 +85,7 @@ class TrainSetup:
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = list(given.indices(split.train))
         rows = given.rows(train)
-        method = policy_entry(config.policy).normalization
-        normalize = METHODS.get(method) or load_part(method)
+        normalize = METHODS.get(config.norm) or load_part(config.norm)
         normalization = normalize(given.state[rows], given.action[rows])
         lengths = given.lengths[train]
         sampler = ExampleSampler(lengths, settings.sampler, settings.batch_size, seed)
@@ -110,7 +111,22 @@ class TrainSetup:
         config = self.config.network
         config = config if initial_weights else without_initial_weights(config)
         torch.manual_seed(derive_seed(self.config.seed, "weights"))
-        return make_model(self.config.policy, config, self.dims)
+        model = make_model(self.config.policy, config, self.dims)
+        self._require_range(model)
+        return model
+
+    def _require_range(self, model: PolicyModel) -> None:
+        """Raise RequestError where the network cannot return the actions of the demonstrations."""
+        if model.action_range is None:
+            return
+        rows = self.demonstrations.rows(self.demonstrations.indices(self.split.train))
+        action = self.normalization.normalize_action(self.demonstrations.action[rows])
+        if (largest := float(np.abs(action).max())) > model.action_range * (1 + 1e-4):
+            raise RequestError(
+                f"norm {self.config.norm}: actions of the demonstrations reach {largest:.3g} and "
+                f"those of {self.config.policy} {model.action_range:g}; give --clip_sample "
+                f"{math.ceil(largest)}, or --norm action_min_max"
+            )
 
     def checkpoint(self, step: int) -> Checkpoint:
         """Return the description of a checkpoint of the run; its folder is set when written."""
@@ -129,7 +145,7 @@ class TrainSetup:
             xml_hash=given.xml_hash,
             step=step,
             train_seed=config.seed,
-            settings=config.training,
+            settings=replace(config.training, norm=config.norm),
             split=self.split,
             dataset={
                 "folder": str(config.demonstrations),
