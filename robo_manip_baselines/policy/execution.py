@@ -147,10 +147,12 @@ class ActionQueue:
         self._age = np.full(num_envs, self._period)  # steps since the last observation of a chunk
         self._place = np.zeros(num_envs, dtype=np.intp)  # of the next action of the chunk
         self._has_chunk = np.zeros(num_envs, dtype=bool)
+        self._is_coming = np.zeros(num_envs, dtype=bool)
 
     def reset(self, env_ids: EnvIds) -> None:
         """Empty the queues of these environments."""
-        self._age[env_ids], self._has_chunk[env_ids] = self._period, False
+        self._age[env_ids] = self._period
+        self._has_chunk[env_ids] = self._is_coming[env_ids] = False
 
     def steps_to_prediction(self, env_ids: EnvIds) -> NDArray[np.intp]:
         """Return (b,) the steps until the next chunk is to be predicted."""
@@ -161,6 +163,7 @@ class ActionQueue:
 
         Past their number (b,), which is 0 where there is no chunk, the last one is repeated.
         """
+        self._receive(env_ids)
         size = self._chunk.shape[1]
         left = np.where(self._has_chunk[env_ids], size - self._place[env_ids], 0)
         places = np.minimum(self._place[env_ids, None] + np.arange(size), size - 1)
@@ -176,12 +179,10 @@ class ActionQueue:
 
         ``held`` (b, A) are the actions where there is none; needed with a delay.
         """
+        self._receive(env_ids)
         due = env_ids[self.steps_to_prediction(env_ids) == 0]
-        self._coming[due], self._age[due] = chunks, 0
-        there = env_ids[self._age[env_ids] == self._delay]
-        self._chunk[there] = self._coming[there]
-        self._place[there] = np.where(self._has_chunk[there], self._first, 0)
-        self._has_chunk[there] = True
+        self._coming[due], self._age[due], self._is_coming[due] = chunks, 0, True
+        self._receive(env_ids)  # at once, without a delay
         moves = self._has_chunk[env_ids]
         if self._waits:
             moves &= self._age[env_ids] >= self._delay
@@ -191,6 +192,13 @@ class ActionQueue:
         self._place[env_ids] += moves
         self._age[env_ids] += 1
         return action if held is None else np.where(moves[:, None], action, held)
+
+    def _receive(self, env_ids: EnvIds) -> None:
+        """Go on with the chunks that are there by now."""
+        there = env_ids[self._is_coming[env_ids] & (self._age[env_ids] == self._delay)]
+        self._chunk[there] = self._coming[there]
+        self._place[there] = np.where(self._has_chunk[there], self._first, 0)
+        self._has_chunk[there], self._is_coming[there] = True, False
 
 
 ActionBuffer = TemporalEnsemble | ActionQueue

@@ -90,11 +90,11 @@ class DenoisingConfig:
         if self.backbone == "perceptron":
             chunk = 2 * 4 * width * self.chunk_size * dims.action
             return count + chunk + self.num_layers * (2 * 16 + 2 * 2 * 4) * width**2
-        for level, channels in enumerate(self.channels):
-            below = self.channels[max(level - 1, 0)]
-            count += kernel * channels * (below + 3 * channels) + kernel * channels * 6 * channels
-            count += 8 * width * channels
-        return count + 4 * kernel * self.channels[-1] ** 2
+        for below, channels in zip((0, *self.channels), self.channels, strict=False):
+            down = channels * (below + 3 * channels)
+            up = below * (2 * channels + 3 * below)
+            count += kernel * (down + up) + 7 * below**2 + 8 * width * (channels + below)
+        return count + 4 * kernel * self.channels[-1] ** 2 + 8 * width * self.channels[-1]
 
 
 def _require_multiple(name: str, value: int, divisor: int, why: str) -> None:
