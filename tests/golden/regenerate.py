@@ -128,7 +128,9 @@ DENOISING: dict[str, Any] = {"chunk_size": 8, "channels": (8, 16), "hidden_size"
 
 def denoising_step(policy: str, backbone: Any) -> dict[str, Any]:
     """Return `training_step` of ``diffusion`` or ``flow``, with a backbone and without images."""
-    settings, dims = {**DENOISING, "backbone": backbone, "num_layers": 1}, replace(DIMS, cameras=0)
+    target = "action" if backbone == "perceptron" else "noise"
+    settings: dict[str, Any] = {**DENOISING, "backbone": backbone, "target": target}
+    settings, dims = {**settings, "num_layers": 1}, replace(DIMS, cameras=0)
     model = (
         FlowModel(FlowConfig(**settings, max_prefix=3), dims)
         if policy == "flow"

@@ -33,6 +33,9 @@ class DenoisingConfig:
         backbone: unet, convolutions over the steps of the chunk (Chi et al.); transformer, tokens
             for the steps that attend to the observation (Chi et al.); or perceptron, over the whole
             chunk, a tenth of their time on a processor.
+        target: of the network: noise, as published (with Flow the velocity, action less noise), or
+            action, from which the noise follows. Actions fill few of the dimensions that noise
+            fills: a small network learns them sooner.
         n_obs_steps: O, observation steps, the present one last (Chi et al.: 2).
         channels: of the levels of the U-Net, each but the last halving the steps (Chi et al.
             without images: 256, 512, 1024).
@@ -53,6 +56,7 @@ class DenoisingConfig:
 
     chunk_size: Chunk = 16
     backbone: Literal["unet", "transformer", "perceptron"] = "unet"
+    target: Literal["noise", "action"] = "noise"
     n_obs_steps: Annotated[int, Interval(ge=1, le=64)] = 2
     channels: tuple[Width, ...] = (256, 512, 1024)
     kernel_size: Annotated[int, Interval(ge=1, le=63)] = 5
@@ -108,6 +112,7 @@ SMALL: dict[str, Any] = {
     "hidden_size": 128,
     "num_layers": 3,
     "vision": "small",
+    "target": "action",
 }
 """Sizes in the presets for a processor without a GPU."""
 

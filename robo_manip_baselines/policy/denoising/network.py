@@ -215,7 +215,7 @@ def keypoints(maps: Tensor) -> Tensor:
 
 
 class DenoisingModel(PolicyModel):
-    """Network that tells, for noisy actions of a known noise level, the direction to actions.
+    """Network that tells, for noisy actions of a known noise level, the noise or the actions.
 
     Initial weights are drawn from PyTorch's default generator.
 
@@ -246,6 +246,7 @@ class DenoisingModel(PolicyModel):
         self.time_width = width
         self.network = NETWORKS[config.backbone](config, dims.action + marks_prefix, dims.action)
         self.marks_prefix = marks_prefix
+        self.finds_action = config.target == "action"
 
     def observe(self, state: Tensor, images: Tensor | None) -> Tensor:
         """Return the embedded observation (B, D) of (B, O, S) and (B, O, N, H, W, 3)."""
@@ -255,10 +256,10 @@ class DenoisingModel(PolicyModel):
             parts.append(self.vision(images.flatten(0, 2)).view(len(state), -1))
         return self.observation(torch.cat(parts, dim=1))
 
-    def direction(
+    def found(
         self, observed: Tensor, action: Tensor, time: Tensor, is_fixed: Tensor | None = None
     ) -> Tensor:
-        """Return (B, K, A) float32 for actions (B, K, A) at noise levels (B,) from 0 to 1.
+        """Return the target (B, K, A) float32 for actions (B, K, A) at levels (B,) from 0 to 1.
 
         ``observed`` is of `observe`; ``is_fixed`` (B, K), only for a network that marks prefixes.
         """

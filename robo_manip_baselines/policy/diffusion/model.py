@@ -31,9 +31,10 @@ def squared_cosine(levels: int) -> NDArray[np.float64]:
 
     The squared-cosine schedule (Nichol & Dhariwal 2021, eq. 17, with s = 0.008).
     """
-    cosine = np.cos((np.arange(levels + 1) / levels + 0.008) / 1.008 * np.pi / 2) ** 2
+    share = np.arange(levels + 1, dtype=np.float64) / levels
+    cosine = np.cos((share + 0.008) / 1.008 * np.pi / 2) ** 2
     beta = np.minimum(1.0 - cosine[1:] / cosine[:-1], LARGEST_BETA)
-    return np.cumprod(1.0 - beta)
+    return np.cumprod(1.0 - beta, dtype=np.float64)
 
 
 class DiffusionModel(DenoisingModel):
@@ -56,15 +57,16 @@ class DiffusionModel(DenoisingModel):
         self.action_range = config.clip_sample or None
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the mean squared error of the noise as ``loss``."""
+        """Return the mean squared error of noise or action as ``loss``."""
         action, levels = filled(batch), self.config.diffusion_steps
         noise = batch.noise[:, :-1].view_as(action)
         level = (torch.special.ndtr(batch.noise[:, -1]) * levels).long().clamp(max=levels - 1)
         signal = self.signal[level][:, None, None]
         noisy = signal.sqrt() * action + (1.0 - signal).sqrt() * noise
         observed = self.observe(batch.state, batch.images)
-        found = self.direction(observed, noisy, level / levels)
-        return {"loss": squared_error(found, noise, batch.num_examples)}
+        found = self.found(observed, noisy, level / levels)
+        wanted = action if self.finds_action else noise
+        return {"loss": squared_error(found, wanted, batch.num_examples)}
 
     def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return normalised actions (B, K, A)."""
@@ -94,7 +96,8 @@ class DiffusionModel(DenoisingModel):
             def clean(
                 there: Tensor, time: Tensor = time, root: float = root, spread: float = spread
             ) -> Tensor:
-                return (there - spread * self.direction(observed, there, time)) / root
+                found = self.found(observed, there, time)
+                return found if self.finds_action else (there - spread * found) / root
 
             if action is None or weight is None:
                 estimate = clean(noisy)

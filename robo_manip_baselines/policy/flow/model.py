@@ -35,23 +35,24 @@ class FlowModel(DenoisingModel):
         self.max_delay = config.max_prefix
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the mean squared error of the velocity as ``loss``."""
+        """Return the mean squared error of velocity or action as ``loss``."""
         action, size = filled(batch), self.sample_noise_size
         noise = batch.noise[:, :size].view_as(action)
         time = torch.special.ndtr(batch.noise[:, size])  # uniform from 0 to 1
         position = torch.lerp(noise, action, time[:, None, None])
-        observed, wanted = self.observe(batch.state, batch.images), action - noise
+        observed = self.observe(batch.state, batch.images)
+        wanted = action if self.finds_action else action - noise
         if not self.marks_prefix:
-            velocity = self.direction(observed, position, time)
-            return {"loss": squared_error(velocity, wanted, batch.num_examples)}
+            found = self.found(observed, position, time)
+            return {"loss": squared_error(found, wanted, batch.num_examples)}
         # Each length from 0 to max_prefix is as likely; fixed steps are no error.
         length = torch.special.ndtr(batch.noise[:, size + 1]) * (self.max_prefix + 1)
         steps = torch.arange(self.chunk_size, device=action.device)
         is_fixed = steps < length.floor().clamp(max=self.max_prefix)[:, None]
         position = torch.where(is_fixed[..., None], action, position)
-        velocity = self.direction(observed, position, time, is_fixed)
-        velocity = torch.where(is_fixed[..., None], wanted, velocity)
-        return {"loss": squared_error(velocity, wanted, batch.num_examples)}
+        found = self.found(observed, position, time, is_fixed)
+        found = torch.where(is_fixed[..., None], wanted, found)
+        return {"loss": squared_error(found, wanted, batch.num_examples)}
 
     def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return normalised actions (B, K, A), carried from noise by Euler steps."""
@@ -117,6 +118,5 @@ class FlowModel(DenoisingModel):
     ) -> Tensor:
         if self.marks_prefix and is_fixed is None:
             is_fixed = torch.zeros_like(position[..., 0], dtype=torch.bool)
-        return self.direction(
-            observed, position, torch.full_like(position[:, 0, 0], time), is_fixed
-        )
+        found = self.found(observed, position, torch.full_like(position[:, 0, 0], time), is_fixed)
+        return (found - position) / (1.0 - time) if self.finds_action else found
