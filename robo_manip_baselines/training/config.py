@@ -69,6 +69,8 @@ class TrainConfig(Generic[Network]):
         num_episodes: Use only so many demonstrations, the first ones; all if not given.
         preset: Origin of the defaults: paper, cpu, ..., or auto: paper where there is a GPU, else
             cpu.
+        init_from: Run, checkpoint or shipped:NAME whose weights and normalisation the training
+            begins with, with a schedule of its own; random weights if not given.
         seed: Seed of the weights, of the order of the examples and of the split.
         device: auto, cpu, cuda or cuda:NUMBER.
         out: Run folder; runs/<policy>_<obs>[_h<horizon>][_<corruption>]_<preset>_seed<seed> if
@@ -90,6 +92,7 @@ class TrainConfig(Generic[Network]):
     dataset: Path | None = None
     num_episodes: Episodes | None = None
     preset: str = "cpu"
+    init_from: Path | None = None
     seed: Seed = 0
     device: str = "auto"
     out: Path | None = None

@@ -22,10 +22,11 @@ from robo_manip_baselines.observation.spec import size_text
 from robo_manip_baselines.policy.checkpoint import (
     Checkpoint,
     read_checkpoint,
+    read_weights,
     without_initial_weights,
 )
 from robo_manip_baselines.policy.interface import PolicyDims, PolicyModel
-from robo_manip_baselines.policy.registry import load_part, make_model, require_memory
+from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry, require_memory
 from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import (
@@ -85,8 +86,11 @@ class TrainSetup:
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = list(given.indices(split.train))
         rows = given.rows(train)
-        normalize = METHODS.get(config.norm) or load_part(config.norm)
-        normalization = normalize(given.state[rows], given.action[rows])
+        if config.init_from is None:
+            normalize = METHODS.get(config.norm) or load_part(config.norm)
+            normalization = normalize(given.state[rows], given.action[rows])
+        else:
+            normalization = _initial(config, given).normalization
         lengths = given.lengths[train]
         sampler = ExampleSampler(lengths, settings.sampler, settings.batch_size, seed)
         total = sampler.total_steps(settings)
@@ -113,6 +117,9 @@ class TrainSetup:
         torch.manual_seed(derive_seed(self.config.seed, "weights"))
         model = make_model(self.config.policy, config, self.dims)
         self._require_range(model)
+        if initial_weights and self.config.init_from is not None:
+            initial = read_checkpoint(self.config.init_from)
+            model.load_state_dict(read_weights(initial, model.state_dict()))
         return model
 
     def _require_range(self, model: PolicyModel) -> None:
@@ -223,3 +230,27 @@ class TrainSetup:
         step = start.step if start else 0
         board = open_board(config.logger, run, step, config.to_json())
         return MetricsLog(run / METRICS, step, board)
+
+
+def _initial(config: TrainConfig[Any], given: Demonstrations) -> Checkpoint:
+    """Read the checkpoint that a training begins with, or goes on with once it has begun.
+
+    The weights are worth something with its normalisation alone.
+
+    Raises:
+        RequestError: there is none, or it is of another policy, norm or size.
+    """
+    assert config.init_from is not None
+    begun = bool(list_checkpoints(config.folder))
+    initial = read_checkpoint(config.folder if begun else config.init_from)
+    norm = initial.settings.norm or policy_entry(initial.policy).normalization
+    sizes = initial.dims.state, initial.dims.action
+    pairs = {
+        "policy": (initial.policy, config.policy),
+        "norm": (norm, config.norm),
+        "elements of state and action": (sizes, (given.state.shape[1], given.action.shape[1])),
+    }
+    for name, (there, here) in pairs.items():
+        if there != here:
+            raise RequestError(f"init_from '{config.init_from}': {name} {there}, not {here}")
+    return initial

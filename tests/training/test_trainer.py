@@ -375,3 +375,37 @@ def test_a_norm_beyond_the_range_of_a_policy_is_refused(episodes: Path, tmp_path
     with pytest.raises(RequestError, match=r"norm mean_std: actions .* give --clip_sample"):
         run(line, episodes, tmp_path)
     make_trainer(f"{line} --clip_sample 9", episodes, tmp_path)
+
+
+def test_a_training_begins_with_the_weights_of_another(episodes: Path, tmp_path: Path) -> None:
+    """The average's, and its normalisation, also of fewer demonstrations; nothing else."""
+    run(f"{FLOW} --ema_decay 0.9", episodes, tmp_path / "first")
+    first = read_checkpoint(tmp_path / "first")
+    line = f"{FLOW} --num_episodes 2 --init_from {tmp_path}/first"
+    begun = make_trainer(line, episodes, tmp_path / "second")
+    wanted = load_model(first).state_dict()
+    for name, value in begun.state.model.state_dict().items():
+        assert torch.equal(value, wanted[name]), name
+    assert not begun.state.optimizer.state
+    run(line, episodes, tmp_path / "second", stop_at=4)
+    for path in sorted((tmp_path / "first").rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    assert run(line, episodes, tmp_path / "second") == STEPS  # goes on without it
+    second = read_checkpoint(tmp_path / "second")
+    np.testing.assert_array_equal(second.normalization.state_mean, first.normalization.state_mean)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("--norm mean_std", "norm action_min_max, not mean_std"),
+        ("--obs current", "elements of state and action"),
+        ("--hidden_size 8", "does not fit Flow"),
+    ],
+)
+def test_what_another_training_cannot_begin_with(
+    episodes: Path, tmp_path: Path, more: str, message: str
+) -> None:
+    run(FLOW, episodes, tmp_path / "first")
+    with pytest.raises(RequestError, match=message):
+        make_trainer(f"{FLOW} {more} --init_from {tmp_path}/first", episodes, tmp_path / "second")
