@@ -125,9 +125,18 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_post_page(output: str, page: Page, **_: Any) -> str:
-    """Let search, in pages that are opened as files, use the script that lies with the site."""
+    """Let search, in pages that are opened as files, use the script that lies with the site.
+
+    Raises:
+        PluginError: the page loads anything else from the network.
+    """
+    from mkdocs.exceptions import PluginError
+
     to_root = "../" * page.url.count("/")
-    return output.replace(SEARCH_SHIM, f"{to_root}assets/iframe-worker.js")
+    output = output.replace(SEARCH_SHIM, f"{to_root}assets/iframe-worker.js")
+    if found := re.search(r'src="https?://[^"]*', output):
+        raise PluginError(f"{page.url} loads {found[0]} from the network")
+    return output
 
 
 def api_page() -> str:
