@@ -194,7 +194,7 @@ class Watched(PolicyModel):
 
 def play(settings: ActionExecution, steps: int) -> tuple[Watched, list[NDArray[np.float32]]]:
     model, env = Watched(), np.array([0])
-    runner = PolicyRunner(model, SPEC, normalization(), settings, num_envs=1)
+    runner = PolicyRunner(model, SPEC, normalization(), settings, num_envs=1, tile=1)
     runner.reset(env, [7])
     return model, [runner.act(observe(7, step), None, env)[0] for step in range(steps)]
 
