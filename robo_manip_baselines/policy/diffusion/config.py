@@ -27,7 +27,7 @@ class DiffusionConfig(DenoisingConfig):
 
     Attributes:
         diffusion_steps: noise levels of the training (Chi et al.: 100).
-        sampling_steps: noise levels that sampling visits (Chi et al.: 100, and 16 on robots).
+        sampling_steps: noise levels that sampling visits (Chi et al.: 100, and 10 on robots).
         eta: noise that sampling adds, of that of the training's reverse process: 0 is DDIM (Song et
             al. 2021), 1 with all levels is DDPM (Ho et al. 2020).
         clip_sample: largest absolute normalised action of a prediction (Chi et al.: 1, the range of
@@ -40,7 +40,7 @@ class DiffusionConfig(DenoisingConfig):
     """
 
     diffusion_steps: Annotated[int, Interval(ge=2, le=10_000)] = 100
-    sampling_steps: Annotated[int, Interval(ge=1, le=10_000)] = 16
+    sampling_steps: Annotated[int, Interval(ge=1, le=10_000)] = 10
     eta: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.0
     clip_sample: Amount = 1.0
     max_guidance: Annotated[float, Interval(ge=0.0, le=1e6)] = 5.0
@@ -64,14 +64,14 @@ PRESETS = {
         image_size=(96, 128),
     ),
     "cpu": PolicyPreset(
-        config=DiffusionConfig(**SMALL, backbone="perceptron", sampling_steps=10),
+        config=DiffusionConfig(**SMALL, backbone="perceptron"),
         training=STATE_ONLY_TRAINING,
         execution=_EXECUTION,
         cameras=(),
         object_pose=True,
     ),
     "cpu_images": PolicyPreset(
-        config=DiffusionConfig(**SMALL, sampling_steps=10),
+        config=DiffusionConfig(**SMALL),
         training=STATE_ONLY_TRAINING,
         execution=_EXECUTION,
         cameras=("angle", "front_close"),
