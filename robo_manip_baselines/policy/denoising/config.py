@@ -32,7 +32,7 @@ class DenoisingConfig:
             unet a multiple of 2 for each of its levels but the last.
         backbone: unet, convolutions over the steps of the chunk (Chi et al.); transformer, tokens
             for the steps that attend to the observation (Chi et al.); or perceptron, over the whole
-            chunk, a tenth of their time on a processor.
+            chunk, on a processor in a fourth of their time.
         target: of the network: noise, as published (with Flow the velocity, action less noise), or
             action, from which the noise follows. Actions fill few of the dimensions that noise
             fills: a small network learns them sooner.

@@ -58,7 +58,7 @@ PRESETS = {
         image_size=(96, 128),
     ),
     "cpu": PolicyPreset(
-        config=FlowConfig(**SMALL, backbone="perceptron"),
+        config=FlowConfig(**SMALL, backbone="perceptron", sampling_steps=2),
         training=STATE_ONLY_TRAINING,
         execution=_EXECUTION,
         cameras=(),
