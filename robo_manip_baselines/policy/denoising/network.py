@@ -230,7 +230,7 @@ class DenoisingModel(PolicyModel):
     ) -> None:
         super().__init__()
         self.chunk_size, self.n_obs_steps = config.chunk_size, config.n_obs_steps
-        self.action_size, self.num_cameras = dims.action, dims.cameras
+        self.action_size = dims.action
         width = config.hidden_size
         self.vision = ImageEncoder(config) if dims.cameras else None
         features = dims.state + dims.cameras * 2 * config.keypoints
