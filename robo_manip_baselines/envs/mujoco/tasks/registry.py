@@ -358,6 +358,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "relative": (bool,),
     "arms": (str,),
     "corruption": (dict, type(None)),
+    "face": (str,),
     "face_motion": (str,),
     "motion": (str,),
     "people": (str,),

@@ -240,7 +240,7 @@ class FeedingEnv(FaceEnv):
 
     def watch_contacts(self) -> None:
         """Record which fingers touch the cube, and how hard the robot touches the face."""
-        for first, second in self.data.contact.geom.tolist():
+        for first, second in self.touch.pairs:
             if self._cube_geom in (first, second):
                 self._fingers_on_cube |= self._finger_bits[first] | self._finger_bits[second]
         self._face_force = max(self._face_force, self.max_face_force())
