@@ -127,6 +127,7 @@ def write_aggregation(
         if trained := [condition for condition in plan.conditions if condition.checkpoint]:
             facts["Trained already"] = ", ".join(f"{c.name}: {c.checkpoint}" for c in trained)
         facts["People"] = str(plan.people)
+        facts["Face"] = plan.face
         title, caution = f"Benchmark {plan.env}", preset.caution
         report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
         written = write_tables(out / TABLES, report.tables)

@@ -30,8 +30,8 @@ REGIONS: Final = (
 )
 """``mouth``: its other walls inside; ``head``: the sides and the back; ``neck``: with the bust."""
 
-FACIAL: Final = REGIONS[: REGIONS.index("head")]
-"""Regions of the face itself."""
+_EATING: Final = ("lips", "tongue", "teeth", "mouth")
+"""Regions that food touches when it is eaten."""
 
 GRIPPER, ARM, OTHER = "gripper", "arm", "other"
 ROBOT_PARTS: Final = (GRIPPER, ARM, OTHER)
@@ -69,6 +69,8 @@ class FaceContact(NamedTuple):
     Attributes:
         region: one of `REGIONS`.
         toucher: one of `ROBOT_PARTS` or an object of the task.
+        is_food: the toucher is something that the outside of a visual face does not stop, at the
+            lips or in the mouth: a mouth takes it in.
         force: N, the largest of the physics steps, all contact points together.
         impulse: N s.
         point: (x, y, z) m, frame of ``face/head`` (out of the face, the person's left, up): the
@@ -77,6 +79,7 @@ class FaceContact(NamedTuple):
 
     region: str
     toucher: str
+    is_food: bool
     force: float
     impulse: float
     point: tuple[float, float, float]
@@ -121,7 +124,7 @@ class FaceTouch:
         """Begin a control step."""
         self.pairs: list[list[int]] = []
         self.robot_force = 0.0
-        self._found: dict[tuple[str, str], FaceContact] = {}
+        self._found: dict[tuple[str, str, bool], FaceContact] = {}
 
     def read(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Take in the contacts of a physics step."""
@@ -134,8 +137,8 @@ class FaceTouch:
 
     def _measure(self, model: mujoco.MjModel, data: mujoco.MjData, touching: list[int]) -> None:
         wrench = np.zeros(6)
-        total: dict[tuple[str, str], float] = {}
-        hardest: dict[tuple[str, str], tuple[float, tuple[float, float, float]]] = {}
+        total: dict[tuple[str, str, bool], float] = {}
+        hardest: dict[tuple[str, str, bool], tuple[float, tuple[float, float, float]]] = {}
         for number in touching:
             mujoco.mj_contactForce(model, data, number, wrench)
             if (force := float(wrench[0])) <= 0.0:
@@ -145,9 +148,11 @@ class FaceTouch:
             if self._is_outside[face] and self._is_stopped[other]:
                 self.robot_force = max(self.robot_force, force)
             x, y, z = self._in_head(data, data.contact.pos[number]).tolist()
-            key = self._region_at(face, x, y, z), self._toucher[other]
+            region = self._region_at(face, x, y, z)
+            is_food = region in _EATING and not self._is_stopped[other]
+            key = region, self._toucher[other], is_food
             total[key] = total.get(key, 0.0) + force
-            if force > hardest.get(key, (0.0, None))[0]:
+            if key not in hardest or force > hardest[key][0]:
                 hardest[key] = force, (x, y, z)
         for key, force in total.items():
             before, impulse = self._found.get(key), force * self._dt
@@ -171,7 +176,8 @@ class FaceTouch:
         force, impulse = np.zeros((2, len(REGIONS), len(self.touchers)), dtype=np.float32)
         for contact in self._found.values():
             place = REGIONS.index(contact.region), self.touchers.index(contact.toucher)
-            force[place], impulse[place] = contact.force, contact.impulse
+            force[place] = max(force[place], contact.force)
+            impulse[place] += contact.impulse
         return {"region_force": force, "region_impulse": impulse}
 
     def _in_head(self, data: mujoco.MjData, point: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, CameraRenderer
-from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, MOUTH_BASE, build_cell
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import FACES, REST_OPENING, FaceModel, add_face
 from robo_manip_baselines.envs.mujoco.face.contact import FaceTouch
@@ -264,6 +264,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self._actuators = np.array([model.actuator(servo).id for servo in servos])
         self._gripper_site = model.site("right/gripper").id
         self._mouth_site = model.site("mouth").id
+        outside = (model.geom_contype & FACE) != 0
+        self._face_geoms = frozenset(np.flatnonzero(outside).tolist())
         self._mocap = {
             model.body(body).name: int(model.body_mocapid[body])
             for body in range(model.nbody)
