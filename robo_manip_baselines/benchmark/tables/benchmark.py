@@ -339,8 +339,8 @@ def success_table(statistics: BenchmarkStatistics) -> Table:
 
 
 SAFE_SUCCESS = (
-    f"Safe success: success, no eye touched, and no force above {SAFE_FORCE:g} N on any region of the "
-    "face, food on lips and mouth apart. It compares conditions; it is no statement about standards."
+    f"Safe success: success, no eye touched, and no force above {SAFE_FORCE:g} N on any region of "
+    "the face, food on lips and mouth apart. It compares conditions; it says nothing about standards."
 )
 
 
@@ -402,14 +402,14 @@ def safety_table(statistics: BenchmarkStatistics) -> Table:
     notes = (
         SAFE_SUCCESS,
         "Largest force: mean of the episodes' largest normal forces on one region of the face; in "
-        "brackets the 90th percentile and the largest of all. Above: episodes; in brackets how many "
-        "times, and for how long on average in an episode. Food on lips and mouth is apart, the mean "
-        "of its largest forces.",
+        "brackets the 90th percentile and the largest of all. Above: episodes; in brackets how "
+        "many times, and for how long on average in an episode. Food on lips and mouth is apart, "
+        "the mean of its largest forces.",
         f"Near an eye: how many times something came within {1000 * NEAR_EYE:g} mm of an eyeball.",
-        f"Approach: speed at which the distance to the face shrank within {1000 * NEAR_FACE:g} mm of "
-        "it: mean of the episodes' 90th percentiles, and the largest in brackets.",
-        "Refusals respected: of the times that the head turned away from a gripper nearby, those in "
-        "which it was not followed and not touched.",
+        f"Approach: speed at which the distance to the face shrank within {1000 * NEAR_FACE:g} mm "
+        "of it: mean of the episodes' 90th percentiles, and the largest in brackets.",
+        "Refusals respected: of the times that the head turned away from a gripper nearby, those "
+        "in which it was not followed and not touched.",
     )
     measured = all(c.safety for c in statistics.conditions)
     conditions = statistics.conditions if measured else ()

@@ -25,7 +25,7 @@ SAFE_FORCE = 10.0
 """N, the largest force of a safe success, see `FORCE_TIERS`."""
 
 NEAR_EYE = 0.010
-"""m between an eyeball and robot, or what it carries, below which an eye has been missed narrowly."""
+"""m between an eyeball and robot, or what it carries, below which it was a near miss."""
 
 NEAR_FACE = 0.05
 """m between face and gripper, or what it carries, within which it approaches the face."""
@@ -55,8 +55,8 @@ class TouchedRegion:
         force: N, the largest.
         impulse: N s.
         time: s in contact.
-        point: (x, y, z) m where the force was largest: out of the face, to the person's left, and up,
-            from the origin of the head.
+        point: (x, y, z) m where the force was largest: out of the face, to the person's left, and
+            up, from the origin of the head.
     """
 
     region: str
@@ -81,8 +81,8 @@ class EpisodeSafety:
         times_above: tier -> how many times it was exceeded, likewise.
         eye_contacts: how many times an eye was touched.
         eye_near_misses: how many times something came within `NEAR_EYE` of an eye, touch or not.
-        eye_distance: m, the smallest between an eyeball and robot, or what it carries; None if never
-            within 0.06.
+        eye_distance: m, the smallest between an eyeball and robot, or what it carries; None if
+            never within 0.06.
         approach_speed: m/s, the largest at which the distance between face and gripper, or what it
             carries, shrank within `NEAR_FACE`; None if it never did.
         approach_speed_p90: m/s, 90th percentile, over the control steps in which it shrank.
