@@ -1,0 +1,97 @@
+"""Safety of a scripted expert, for each face and motion: the table of ``docs/safety.md``.
+
+python benchmarks/expert_safety.py --motions recorded sway turn_away --num_episodes 50
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.face import FACES
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
+from robo_manip_baselines.envs.mujoco.tasks.safety import (
+    FORCE_TIERS,
+    EpisodeSafety,
+    SafetyMetrics,
+    SafetySummary,
+    summarize_safety,
+)
+
+
+def run_expert(
+    env: str, expert: str, face: str, motion: str, seeds: range
+) -> tuple[list[bool], list[EpisodeSafety]]:
+    """Let an expert act through episodes; return their success and their safety."""
+    successes, found = [], []
+    with contextlib.closing(make_env(env, cameras=(), face=face, motion=motion)) as made:
+        world = world_of(made)
+        actor = world.task.make_expert(expert, world)
+        for seed in seeds:
+            _, info = made.reset(seed=seed)
+            actor.reset()
+            metrics, ended = SafetyMetrics(CONTROL_PERIOD), False
+            while not ended:
+                _, _, terminated, truncated, info = made.step(actor.act())
+                metrics.update(info)
+                ended = terminated or truncated
+            successes.append(bool(info["is_success"]))
+            found.append(metrics.result(info))
+    return successes, found
+
+
+def row_of(face: str, motion: str, successes: list[bool], safety: SafetySummary) -> str:
+    """Return a row of the table."""
+    above = " / ".join(str(safety.above[str(tier)]) for tier in FORCE_TIERS)
+    speed = "–"
+    if safety.approach_speed is not None:
+        speed = f"{safety.approach_speed_p90:.3f} ({safety.approach_speed:.3f})"
+    refusals = "–"
+    if safety.refusals is not None:
+        refusals = f"{safety.refusals_respected} of {safety.refusals}"
+    cells = (
+        face,
+        motion,
+        f"{sum(successes)} of {len(successes)}",
+        f"{safety.safe} of {safety.episodes}",
+        f"{safety.force:.1f} ({safety.force_max:.1f})",
+        above,
+        f"{safety.food_force:.1f}",
+        str(safety.eye_contacts),
+        str(safety.eye_near_misses),
+        speed,
+        refusals,
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="FeedingEnv")
+    parser.add_argument("--expert", default="reactive")
+    parser.add_argument("--faces", nargs="+", default=FACES, choices=FACES)
+    parser.add_argument("--motions", nargs="+", default=["recorded"])
+    parser.add_argument("--num_episodes", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    tiers = " / ".join(map(str, FORCE_TIERS))
+    head = (
+        "face | motion | success | safe success | largest force, N: mean (largest) | "
+        f"episodes above {tiers} N | food on lips, N | eyes touched | near an eye | "
+        "approach, m/s: p90 (largest) | refusals respected"
+    )
+    print(f"| {head} |\n|{'---|' * (head.count('|') + 1)}")
+    seeds = range(given.seed, given.seed + given.num_episodes)
+    for motion in given.motions:
+        for face in given.faces:
+            successes, found = run_expert(given.env, given.expert, face, motion, seeds)
+            summary = summarize_safety(found)
+            assert summary is not None
+            print(row_of(face, motion, successes, summary), flush=True)
+
+
+if __name__ == "__main__":
+    main()
