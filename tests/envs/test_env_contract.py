@@ -39,6 +39,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "arms": "both",
         "motion": "recorded+tremor",
     },
+    "physical face": {"obs": "current", "face": "physical", "motion": "recorded+turn_away"},
     "after lift": {"obs": "current", "face_motion": "after_lift"},
 }
 
@@ -136,6 +137,9 @@ def test_info_has_what_every_task_promises(env: gymnasium.Env[Any, Any]) -> None
         assert given["is_success_strict"] is False
         assert given["completion_time"] is None
         assert given["phase"] in world.phase_names
+        assert given["face_contacts"] == ()
+        assert given["face_proximity"].mouth == pytest.approx(world.mouth_track[0], abs=1e-9)
+        assert given["is_refusing"] is (False if "turn_away" in str(world.motion) else None)
 
 
 def test_an_entry_describes_its_environment(name: str) -> None:

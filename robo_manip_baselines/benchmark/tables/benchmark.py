@@ -340,7 +340,8 @@ def success_table(statistics: BenchmarkStatistics) -> Table:
 
 SAFE_SUCCESS = (
     f"Safe success: success, no eye touched, and no force above {SAFE_FORCE:g} N on any region of "
-    "the face, food on lips and mouth apart. It compares conditions, and is no claim about standards."
+    "the face, food on lips and mouth apart. It compares conditions; it is no claim about "
+    "standards."
 )
 
 

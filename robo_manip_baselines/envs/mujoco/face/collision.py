@@ -208,7 +208,7 @@ TISSUE: Final[Mapping[str, float]] = {
 """N/m under the end of a finger. Thicknesses of soft tissue on bone, the moduli of eye, tongue and
 inside, and the stiffness of teeth (the stiffest that 2 ms steps bear) are assumptions."""
 
-FINGER_COMPLIANCE: Final = 3.53 + 0.22
+FINGER_COMPLIANCE: Final = 3.53 + 0.40
 """1/kg, inverse masses of a finger link of the arm (MuJoCo's ``body_invweight0``) and of the head.
 MuJoCo states the stiffness of contacts by the masses that meet; this makes it N/m for a finger."""
 
@@ -263,7 +263,7 @@ def add_physical_collision(body: Bodies, model: FaceModel) -> None:
     names = [ellipsoid[1] for ellipsoid in _PHYSICAL_ELLIPSOIDS]
     skin = {name: style(name, FACE | MOUTH, _SLIPPERY) for name in names}
     _add_ellipsoids(body, _PHYSICAL_ELLIPSOIDS, skin)
-    _add_neck_and_bust(body, style("neck", FACE | MOUTH, _SLIPPERY))
+    _add_neck_and_bust(body, style("neck", FACE, _SLIPPERY))
     _add_lips(body, model, style("lips", FACE | MOUTH, _SLIPPERY))
     # Where they are at `REST_OPENING`; the floor of the mouth then goes with the jaw.
     angle = model.jaw_angle(REST_OPENING)
