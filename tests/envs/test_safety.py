@@ -24,6 +24,7 @@ MOUTH = np.array([0.0, 0.5, 0.35])
 def step(
     *contacts: FaceContact,
     face: float | None = None,
+    load: float | None = None,
     eye: float | None = None,
     refuses: bool | None = None,
     gripper: float = 0.6,
@@ -35,7 +36,7 @@ def step(
     return {
         "is_success": success,
         "face_contacts": contacts,
-        "face_proximity": Proximity(face, eye, grippers, MOUTH),
+        "face_proximity": Proximity(face, load, eye, grippers, MOUTH),
         "is_refusing": refuses,
     }
 
@@ -138,6 +139,11 @@ def test_approach_speed(distances: list[float | None], speeds: list[float]) -> N
     else:
         assert found.approach_speed == pytest.approx(max(speeds))
         assert found.approach_speed_p90 == pytest.approx(np.percentile(speeds, 90))
+
+
+def test_a_load_that_is_taken_up_is_no_approach() -> None:
+    found = safety(step(face=0.04), step(face=0.04, load=0.01), step(face=0.04, load=0.009))
+    assert found.approach_speed == pytest.approx(0.05)
 
 
 def refusal(way: list[float], after: int = 30, *contacts: FaceContact) -> EpisodeSafety:

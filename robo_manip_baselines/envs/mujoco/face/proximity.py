@@ -29,18 +29,23 @@ _OUTSIDE: Final = ("forehead", "eyes", "nose", "cheeks", "lips", "chin", "head")
 """Regions whose geoms are the surface of the face."""
 
 
+_NOWHERE: Final = -1
+"""Place in `Proximity` of the distance between the face and the links of an arm."""
+
+
 class Proximity(NamedTuple):
     """Nearness of the robot at the end of a control step.
 
     Attributes:
-        face: m between the face and a gripper or what it carries; None beyond `RANGE`; 0 where they
-            touch or overlap.
+        hand: m between the face and a gripper; None beyond `RANGE`; 0 where they touch or overlap.
+        load: m between the face and what a gripper carries, likewise; None without a load.
         eye: m between an eyeball and any part of the robot or what it carries, likewise.
         grippers: (2, 3) m, world: the sites ``left/gripper`` and ``right/gripper``.
         mouth: (3,) m, world.
     """
 
-    face: float | None
+    hand: float | None
+    load: float | None
     eye: float | None
     grippers: NDArray[np.float64]
     mouth: NDArray[np.float64]
@@ -70,7 +75,8 @@ class FaceProximity:
             kinds[geom] if is_object[geom] and body not in arms else ""
             for geom, body in zip(self._parts.tolist(), root, strict=True)
         ]
-        self._is_arm = [kinds[geom] == ARM for geom in self._parts.tolist()]
+        places = {ARM: _NOWHERE, GRIPPER: 0}
+        self._place = [places.get(kinds[geom], 1) for geom in self._parts.tolist()]
         self._kinds = [*kinds, OTHER]
         surface = [
             geom
@@ -92,7 +98,7 @@ class FaceProximity:
         places = data.geom_xpos
         offset = places.take(self._parts, axis=0)[:, None] - places.take(self._face, axis=0)
         square = np.einsum("ijk,ijk->ij", offset, offset)
-        nearest = [RANGE, RANGE]
+        nearest = [RANGE] * 3  # in the order of `Proximity`
         near = np.flatnonzero(square < self._limit)
         if len(near):
             # Spheres around the geoms tell which pairs may be nearest: they come first.
@@ -101,16 +107,17 @@ class FaceProximity:
             carried = self._carried(pairs)
             for pair, least in zip(near[order].tolist(), bound[order].tolist(), strict=True):
                 part, other = divmod(pair, len(self._face))
-                free, is_eye = self._free[part], other >= self._surface
-                if (free and free not in carried) or (self._is_arm[part] and not is_eye):
+                place = 2 if other >= self._surface else self._place[part]
+                free = self._free[part]
+                if place == _NOWHERE or (free and free not in carried):
                     continue
-                if least < (best := nearest[is_eye]):
+                if least < (best := nearest[place]):
                     geoms = int(self._parts[part]), int(self._face[other])
                     distance = mujoco.mj_geomDistance(model, data, *geoms, best, None)
-                    nearest[is_eye] = min(best, max(distance, 0.0))
-        face, eye = (distance if distance < RANGE else None for distance in nearest)
+                    nearest[place] = min(best, max(distance, 0.0))
+        found = (distance if distance < RANGE else None for distance in nearest)
         sites = data.site_xpos.take(self._sites, axis=0)
-        return Proximity(face, eye, sites[:2], sites[2])
+        return Proximity(*found, sites[:2], sites[2])
 
     def _carried(self, pairs: Sequence[Sequence[int]]) -> set[str]:
         """Return the kinds of things that touch a gripper."""

@@ -202,7 +202,7 @@ class SafetyMetrics:
         self._above = {tier: _Spells() for tier in FORCE_TIERS}
         self._at_eye, self._near_eye = _Spells(), _Spells()
         self._eye_distance: float | None = None
-        self._face_distance: float | None = None
+        self._distances: tuple[float | None, ...] = (None, None)
         self._speeds: list[float] = []
         self._touched: dict[tuple[str, str, bool], TouchedRegion] = {}
         self._refusals: _Refusals | None = None
@@ -224,7 +224,7 @@ class SafetyMetrics:
         self._near_eye.update(near.eye is not None and near.eye < NEAR_EYE)
         if near.eye is not None and (self._eye_distance is None or near.eye < self._eye_distance):
             self._eye_distance = near.eye
-        self._approach(near.face)
+        self._approach((near.hand, near.load))
         if (is_refusing := info["is_refusing"]) is not None:
             if self._refusals is None:
                 self._refusals = _Refusals(self._period)
@@ -262,13 +262,15 @@ class SafetyMetrics:
         # Times are sums of 0.02 s; microseconds hide what floating point adds to them.
         self._touched[key] = TouchedRegion(*key, force, impulse, round(time, 6), point)
 
-    def _approach(self, distance: float | None) -> None:
-        """Note the speed at which the face's distance shrank to ``distance`` m."""
-        before, self._face_distance = self._face_distance, distance
-        if before is None or distance is None or before > NEAR_FACE:
-            return
-        if distance < before:
-            self._speeds.append((before - distance) / self._period)
+    def _approach(self, distances: tuple[float | None, ...]) -> None:
+        """Note the speed at which the distances of hand and load from the face shrank, m."""
+        speed = 0.0
+        for before, now in zip(self._distances, distances, strict=True):
+            if before is not None and now is not None and before <= NEAR_FACE:
+                speed = max(speed, (before - now) / self._period)
+        self._distances = distances
+        if speed > 0.0:
+            self._speeds.append(speed)
 
     def _seconds(self, steps: int) -> float:
         return round(steps * self._period, 6)
