@@ -50,6 +50,7 @@ def test_all_are_drawn_and_say_what_is_to_be_seen(
         "completion_times",
         "arrivals",
         "failures",
+        "touches",
         "delay_and_horizon",
         "net_lead",
     ]
