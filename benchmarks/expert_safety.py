@@ -5,9 +5,11 @@ python benchmarks/expert_safety.py --motions recorded sway turn_away --num_episo
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+from dataclasses import dataclass
+from pathlib import Path
 
+from robo_manip_baselines.benchmark.report.figures import draw_faces, styled_figure
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.face import FACES
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
@@ -19,6 +21,27 @@ from robo_manip_baselines.envs.mujoco.tasks.safety import (
     SafetySummary,
     summarize_safety,
 )
+from robo_manip_baselines.runs.command import parse, run_command
+
+
+@dataclass(frozen=True)
+class Options:
+    """Let a scripted expert act, and print its safety for each motion and face."""
+
+    env: str = "FeedingEnv"
+    """Task."""
+    expert: str = "reactive"
+    """Name in the task's entry."""
+    faces: tuple[str, ...] = FACES
+    """Kinds of face."""
+    motions: tuple[str, ...] = ("recorded",)
+    """Motions of the face by name."""
+    num_episodes: int = 50
+    """Episodes of each, one a seed."""
+    seed: int = 0
+    """Seed of the first."""
+    figure: Path | None = None
+    """PNG of the faces with their contact points."""
 
 
 def run_expert(
@@ -68,15 +91,8 @@ def row_of(face: str, motion: str, successes: list[bool], safety: SafetySummary)
 
 
 def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--env", default="FeedingEnv")
-    parser.add_argument("--expert", default="reactive")
-    parser.add_argument("--faces", nargs="+", default=FACES, choices=FACES)
-    parser.add_argument("--motions", nargs="+", default=["recorded"])
-    parser.add_argument("--num_episodes", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    """Print the table, and draw the figure if one is asked for."""
+    options = parse(Options, "python benchmarks/expert_safety.py --motions recorded sway")
     tiers = " / ".join(map(str, FORCE_TIERS))
     head = (
         "face | motion | success | safe success | largest force, N: mean (largest) | "
@@ -84,14 +100,19 @@ def main() -> None:
         "approach, m/s: p90 (largest) | refusals respected"
     )
     print(f"| {head} |\n|{'---|' * (head.count('|') + 1)}")
-    seeds = range(given.seed, given.seed + given.num_episodes)
-    for motion in given.motions:
-        for face in given.faces:
-            successes, found = run_expert(given.env, given.expert, face, motion, seeds)
-            summary = summarize_safety(found)
-            assert summary is not None
-            print(row_of(face, motion, successes, summary), flush=True)
+    seeds = range(options.seed, options.seed + options.num_episodes)
+    panels: dict[str, list[EpisodeSafety]] = {}
+    for motion in options.motions:
+        for face in options.faces:
+            successes, found = run_expert(options.env, options.expert, face, motion, seeds)
+            panels[f"{face}, {motion}"] = found
+            if summary := summarize_safety(found):
+                print(row_of(face, motion, successes, summary), flush=True)
+    if options.figure:
+        with styled_figure("agg", "white") as figure:
+            draw_faces(figure, panels)
+            figure.savefig(options.figure, dpi=150)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

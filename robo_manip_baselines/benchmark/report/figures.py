@@ -340,26 +340,44 @@ def draw_failures(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, st
 
 def draw_touches(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
     """Draw the face from the front with its contact points, one panel for each condition."""
+    conditions = statistics.conditions
+    draw_faces(
+        figure,
+        {
+            c.condition.label: [row.result.safety for row in c.rows if row.result.safety]
+            for c in conditions
+        },
+    )
+    caption = (
+        "For each episode, region and body that touched it, the point at which the force was "
+        "largest; in the corner the episodes with a contact, food on lips and in the mouth apart."
+    )
+    force, label = max((c.safety.force_max, c.condition.label) for c in conditions if c.safety)
+    if force == 0.0:
+        return caption, "Nothing but food touched a face."
+    return caption, f"The largest force, {force:.1f} N, is that of {label}."
+
+
+def draw_faces(figure: Any, panels: Mapping[str, Sequence[EpisodeSafety]]) -> None:
+    """Draw the face from the front with the contact points of episodes, given label -> episodes."""
     face = FaceModel.load()
     surface = 1000.0 * face.deform(face.jaw_angle(REST_OPENING))[:, 1:]
     lines = [surface[np.append(ring, ring[0])] for ring in (face_oval(face), *face.rings.values())]
-    conditions = statistics.conditions
-    columns = min(4, len(conditions))
-    rows = -(-len(conditions) // columns)
-    figure.set_size_inches(2.2 * columns, 2.75 * rows + 0.6)
-    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
-    for axes in panels[len(conditions) :]:
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
+    figure.set_size_inches(max(2.2 * columns, 4.4), 2.75 * rows + 0.7)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+    for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    for axes, c in zip(panels, conditions, strict=False):
+    for axes, (label, episodes) in zip(grid, panels.items(), strict=False):
         for line in lines:
             axes.plot(*line.T, color=GREY, lw=0.8, zorder=1)
-        episodes = [row.result.safety for row in c.rows if row.result.safety]
         _draw_contact_points(axes, episodes)
         touched = sum(own.force > 0.0 for own in episodes)
         largest = max((own.force for own in episodes), default=0.0)
         text = f"{touched} of {len(episodes)} episodes\nlargest {largest:.1f} N"
         axes.text(0.02, 0.01, text, transform=axes.transAxes, fontsize=7, va="bottom")
-        axes.set_title(_in_two_lines(c.condition.label), fontsize=9)
+        axes.set_title(_in_two_lines(label), fontsize=9)
         axes.set(xlim=(-100.0, 100.0), ylim=(-135.0, 95.0), aspect="equal")
     figure.supxlabel("across the face, mm (right: the person's left)", fontsize=10)
     figure.supylabel("up, mm", fontsize=10)
@@ -370,15 +388,6 @@ def draw_touches(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str
     ]
     marks += axes.plot([], [], "o", mfc="none", mec=GREY, ms=5, label="food on lips, in the mouth")
     figure.legend(handles=marks, loc="outside lower center", ncols=3, fontsize=8)
-    caption = (
-        "For each episode, region and body that touched it, the point at which the force was "
-        "largest; in the corner the episodes with a contact, food on lips and in the mouth apart."
-    )
-    ranked = [(c.safety.force_max, c.condition.label) for c in conditions if c.safety]
-    force, label = max(ranked)
-    if force == 0.0:
-        return caption, "Nothing but food touched a face."
-    return caption, f"The largest force, {force:.1f} N, is that of {label}."
 
 
 def _draw_contact_points(axes: Any, episodes: Sequence[EpisodeSafety]) -> None:

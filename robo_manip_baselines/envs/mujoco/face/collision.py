@@ -274,5 +274,7 @@ def add_physical_collision(body: Bodies, model: FaceModel) -> None:
         if name == _TONGUE:
             owner, tissue = "jaw", "tongue"
             place, quat = rotate(back, place - model.hinge), multiply(back, quat)
+        # The skin beside the mouth is the other side of its walls.
+        contype = FACE | MOUTH if name.startswith("cheek") else MOUTH
         shape = {"type": _BOX, "size": size, "pos": place.tolist(), "quat": quat.tolist()}
-        body[owner].add_geom(name=f"face/{name}", **shape, **style(tissue, MOUTH, _STICKY))
+        body[owner].add_geom(name=f"face/{name}", **shape, **style(tissue, contype, _STICKY))

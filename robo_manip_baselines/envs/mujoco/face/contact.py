@@ -63,6 +63,10 @@ _BROWS: Final = 0.046
 """m, body frame: height of the eyebrows, above which the front of the skull is the forehead."""
 
 
+_WALL: Final = 0.040
+"""m from the middle of the face: the walls of the mouth, inside and outside."""
+
+
 class FaceContact(NamedTuple):
     """Contact of one region with one toucher during a control step.
 
@@ -194,6 +198,8 @@ class FaceTouch:
                 return "eyes"
             if region == "head" and x > 0.0:
                 return "forehead" if z > _BROWS else "cheeks"
+        if region == "mouth" and abs(y) > _WALL:
+            return "cheeks"
         return region
 
 
