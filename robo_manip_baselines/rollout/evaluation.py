@@ -454,11 +454,11 @@ def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> str:
         "size of the state": (checkpoint.dims.state, config.vector_size),
         "model hash": (checkpoint.xml_hash[:12], own["xml_hash"][:12]),
     }
-    for name, (trained, here) in pairs.items():
-        if trained != here:
+    for name, (trained, found) in pairs.items():
+        if trained != found:
             raise RequestError(
                 f"checkpoint '{checkpoint.folder}' was trained with {name} {trained}; {config.env} "
-                f"has {here} here; install the release that trained it, "
+                f"has {found} here; install the release that trained it, "
                 f"{checkpoint.versions.get('robo_manip_baselines', 'unknown')}, or train again"
             )
     return here["xml_hash"]

@@ -63,6 +63,9 @@ _BROWS: Final = 0.046
 """m, body frame: height of the eyebrows, above which the front of the skull is the forehead."""
 
 
+_BRIDGE: Final = 0.012
+"""m from the middle of the face to the sides of the nose's bridge."""
+
 _WALL: Final = 0.040
 """m from the middle of the face: the walls of the mouth, inside and outside."""
 
@@ -197,7 +200,8 @@ class FaceTouch:
             if np.linalg.norm(self._eyes - (x, y, z), axis=1).min() < EYE_REACH:
                 return "eyes"
             if region == "head" and x > 0.0:
-                return "forehead" if z > _BROWS else "cheeks"
+                beside = "cheeks" if abs(y) > _BRIDGE else "nose"
+                return "forehead" if z > _BROWS else beside
         if region == "mouth" and abs(y) > _WALL:
             return "cheeks"
         return region
