@@ -51,6 +51,7 @@ def run_expert(
     successes, found = [], []
     with contextlib.closing(make_env(env, cameras=(), face=face, motion=motion)) as made:
         world = world_of(made)
+        world.measures_proximity = True
         actor = world.task.make_expert(expert, world)
         for seed in seeds:
             _, info = made.reset(seed=seed)

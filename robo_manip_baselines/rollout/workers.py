@@ -153,6 +153,7 @@ class LocalEnvs:
         env = self._envs[number]
         world = world_of(env)
         world.renders_images = needs_images
+        world.measures_proximity = True
         if seed is None:
             observation, _, terminated, truncated, info = env.step(self.arrays["actions"][number])
             metrics = self._metrics[number]

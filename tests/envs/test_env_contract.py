@@ -138,9 +138,12 @@ def test_info_has_what_every_task_promises(env: gymnasium.Env[Any, Any]) -> None
         assert given["completion_time"] is None
         assert given["phase"] in world.phase_names
         assert given["face_contacts"] == ()
-        assert given["face_proximity"].hand is None
+        assert given["face_proximity"] is None
         assert given["is_refusing"] is (False if "turn_away" in str(world.motion) else None)
-    np.testing.assert_allclose(later["face_proximity"].mouth, world.mouth_track[0], atol=1e-9)
+    world.measures_proximity = True
+    near = env.step(env.action_space.sample())[-1]["face_proximity"]
+    np.testing.assert_allclose(near.mouth, world.mouth_track[0], atol=1e-9)
+    np.testing.assert_array_equal(near.grippers[1], world.gripper_position)
 
 
 def test_an_entry_describes_its_environment(name: str) -> None:

@@ -101,9 +101,10 @@ class FaceProximity:
         nearest = [RANGE] * 3  # in the order of `Proximity`
         near = np.flatnonzero(square < self._limit)
         if len(near):
-            # Spheres around the geoms tell which pairs may be nearest: they come first.
-            bound = np.sqrt(square.take(near)) - self._reach.take(near)
-            order = np.argsort(bound)
+            # The nearest centres first; then spheres around the geoms rule most others out.
+            centres = np.sqrt(square.take(near))
+            order = np.argsort(centres)
+            bound = centres - self._reach.take(near)
             carried = self._carried(pairs)
             for pair, least in zip(near[order].tolist(), bound[order].tolist(), strict=True):
                 part, other = divmod(pair, len(self._face))

@@ -82,8 +82,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     |---|---|---|
     | ``face_contacts`` | tuple of `FaceContact` | what touched which region of the face in the
     step, how hard (N), with which impulse (N s) and where; empty where nothing did |
-    | ``face_proximity`` | `Proximity` | distances of the robot, and of what it carries, from face
-    and eyes (m), grippers and mouth |
+    | ``face_proximity`` | `Proximity` or None | distances of the robot, and of what it carries, from
+    face and eyes (m), grippers and mouth; None unless ``measures_proximity`` |
     | ``is_refusing`` | bool or None | the head is turned away; None where the motion has no
     ``turn_away`` |
 
@@ -112,6 +112,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         observation_spec: what is observed.
         renders_images: whether observations include images; rollouts clear it for steps whose
             images no policy reads.
+        measures_proximity: whether ``info`` has distances from the face, which take a tenth of a
+            millisecond a step; evaluations set it.
         vector: (S,) float32, all vectors of the last observation, packed.
 
     Raises:
@@ -167,6 +169,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         if object_pose and not self.task.names.objects:
             raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")
         self.renders_images = True
+        self.measures_proximity = False
         self.face_kind = require_choice("face", face, FACES)
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
         self.motion = parse_motion(motion)
@@ -315,6 +318,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             timestep=self.model.opt.timestep,
             substeps=self.substeps,
         )
+        # Of a physical face, the head moves by forces, and the mouth with it.
+        placed = ("face/torso",) if self._compliant_head else self.replay.bodies
+        self._placed = {body: self.replay.bodies[body] for body in placed}
         self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
         self.reset_task(self.np_random)
@@ -326,7 +332,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             self._compliant_head.reset(self.data, self.replay)
         mujoco.mj_forward(self.model, self.data)
         self.touch.clear()
-        self.proximity = self._proximity.measure(self.model, self.data, ())
         if self._pipeline:
             # Last, so that the world is the same as without corruption.
             drawn = int(self.np_random.integers(2**32)) if seed is None else seed
@@ -377,7 +382,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         # After a step, sites and cameras are still where they were before its integration.
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-        self.proximity = self._proximity.measure(self.model, self.data, self.touch.pairs)
 
     def _checked_action(self, action: Any) -> Floats:
         """Return an action as float64.
@@ -643,15 +647,17 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         if head and substep:
             head.drive(self.data, row)
             head.place_mouth(self.data)
-        for body in ("face/torso",) if head else self.replay.bodies:
-            position, orientation = self.replay.bodies[body]
+        for body, (position, orientation) in self._placed.items():
             self.data.mocap_pos[self._mocap[body]] = position[row]
             self.data.mocap_quat[self._mocap[body]] = orientation[row]
 
     def _safety_info(self) -> dict[str, Any]:
+        near = None
+        if self.measures_proximity:
+            near = self._proximity.measure(self.model, self.data, self.touch.pairs)
         return {
             "face_contacts": self.touch.contacts,
-            "face_proximity": self.proximity,
+            "face_proximity": near,
             "is_refusing": self._is_refusing(),
         }
 
