@@ -82,8 +82,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     |---|---|---|
     | ``face_contacts`` | tuple of `FaceContact` | what touched which region of the face in the
     step, how hard (N), with which impulse (N s) and where; empty where nothing did |
-    | ``face_proximity`` | `Proximity` or None | distances of the robot, and of what it carries, from
-    face and eyes (m), grippers and mouth; None unless ``measures_proximity`` |
+    | ``face_proximity`` | `Proximity` or None | distances of the robot, and of what it carries,
+    from face and eyes (m), grippers and mouth; None unless ``measures_proximity`` |
     | ``is_refusing`` | bool or None | the head is turned away; None where the motion has no
     ``turn_away`` |
 
