@@ -362,7 +362,9 @@ def draw_faces(figure: Any, panels: Mapping[str, Sequence[EpisodeSafety]]) -> No
     """Draw the face from the front with the contact points of episodes, given label -> episodes."""
     face = FaceModel.load()
     surface = 1000.0 * face.deform(face.jaw_angle(REST_OPENING))[:, 1:]
-    lines = [surface[np.append(ring, ring[0])] for ring in (face_oval(face), *face.rings.values())]
+    names = ("eye_left", "eye_right", "lips_outer", "lips_inner")
+    rings = [face_oval(face), *(face.rings[name] for name in names)]
+    lines = [surface[np.append(ring, ring[0])] for ring in rings]
     columns = min(4, len(panels))
     rows = -(-len(panels) // columns)
     figure.set_size_inches(max(2.2 * columns, 4.4), 2.75 * rows + 0.7)
@@ -381,13 +383,13 @@ def draw_faces(figure: Any, panels: Mapping[str, Sequence[EpisodeSafety]]) -> No
         axes.set(xlim=(-100.0, 100.0), ylim=(-135.0, 95.0), aspect="equal")
     figure.supxlabel("across the face, mm (right: the person's left)", fontsize=10)
     figure.supylabel("up, mm", fontsize=10)
-    names = [f"up to {tier} N" for tier in FORCE_TIERS] + [f"above {FORCE_TIERS[-1]} N"]
+    labels = [f"up to {tier} N" for tier in FORCE_TIERS] + [f"above {FORCE_TIERS[-1]} N"]
     marks = [
         axes.plot([], [], "o", color=color, ms=5, label=name)[0]
-        for color, name in zip(TIER_COLORS, names, strict=True)
+        for color, name in zip(TIER_COLORS, labels, strict=True)
     ]
     marks += axes.plot([], [], "o", mfc="none", mec=GREY, ms=5, label="food on lips, in the mouth")
-    figure.legend(handles=marks, loc="outside lower center", ncols=3, fontsize=8)
+    figure.legend(handles=marks, loc="outside upper center", ncols=3, fontsize=8)
 
 
 def _draw_contact_points(axes: Any, episodes: Sequence[EpisodeSafety]) -> None:
