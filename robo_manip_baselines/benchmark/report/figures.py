@@ -385,10 +385,12 @@ def draw_faces(figure: Any, panels: Mapping[str, Sequence[EpisodeSafety]]) -> No
     figure.supylabel("up, mm", fontsize=10)
     labels = [f"up to {tier} N" for tier in FORCE_TIERS] + [f"above {FORCE_TIERS[-1]} N"]
     marks = [
-        axes.plot([], [], "o", color=color, ms=5, label=name)[0]
+        grid[0].plot([], [], "o", color=color, ms=5, label=name)[0]
         for color, name in zip(TIER_COLORS, labels, strict=True)
     ]
-    marks += axes.plot([], [], "o", mfc="none", mec=GREY, ms=5, label="food on lips, in the mouth")
+    marks += grid[0].plot(
+        [], [], "o", mfc="none", mec=GREY, ms=5, label="food on lips, in the mouth"
+    )
     figure.legend(handles=marks, loc="outside upper center", ncols=3, fontsize=8)
 
 

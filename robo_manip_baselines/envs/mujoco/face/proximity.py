@@ -116,9 +116,9 @@ class FaceProximity:
                     geoms = int(self._parts[part]), int(self._face[other])
                     distance = mujoco.mj_geomDistance(model, data, *geoms, best, None)
                     nearest[place] = min(best, max(distance, 0.0))
-        found = (distance if distance < RANGE else None for distance in nearest)
+        hand, load, eye = (distance if distance < RANGE else None for distance in nearest)
         sites = data.site_xpos.take(self._sites, axis=0)
-        return Proximity(*found, sites[:2], sites[2])
+        return Proximity(hand, load, eye, sites[:2], sites[2])
 
     def _carried(self, pairs: Sequence[Sequence[int]]) -> set[str]:
         """Return the kinds of things that touch a gripper."""
