@@ -110,6 +110,8 @@ class RolloutOptions:
         num_episodes: Episodes, one for each seed from --seed on.
         seed: Seed of the first episode; if not given, 0 with --scripted and 1000 with --policy.
         out: Folder to write to; if not given, dataset/<env> or results/<env>_<run>.
+        face: Kind of face: visual, or physical, soft tissue on a head that yields. If not given,
+            visual, or as in the demonstrations of the policy.
         face_motion: Start of the face's motion: with the episode, or after_lift. If not given,
             episode, or as in the demonstrations of the policy.
         motion: Motion of the face: recorded, sway, ..., with parameters sway:amplitude=0.03, or a
@@ -133,6 +135,7 @@ class RolloutOptions:
     num_episodes: Episodes = 50
     seed: Seed | None = None
     out: Path | None = None
+    face: str | None = None
     face_motion: str | None = None
     motion: str | None = None
     people: str | None = None
@@ -152,16 +155,18 @@ class RolloutOptions:
         return range(start, start + self.num_episodes)
 
     @property
-    def motion_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about the motion that were given.
+    def face_arguments(self) -> dict[str, Any]:
+        """Arguments of the environment about the face and its motion that were given.
 
         Raises:
-            RequestError: there are no such motion or people.
+            RequestError: there are no such face, motion or people.
         """
+        from robo_manip_baselines.envs.mujoco.face import FACES
         from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
         from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 
         given = {
+            "face": self.face and require_choice("face", self.face, FACES),
             "face_motion": self.face_motion,
             "motion": None if self.motion is None else str(parse_motion(self.motion)),
             "people": self.people and require_choice("people", self.people, PEOPLE),
@@ -227,7 +232,7 @@ def to_collection(options: RolloutOptions) -> Collection:
         out=options.out or Path("dataset") / options.env,
         expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
         seeds=options.seeds(first=0),
-        env_kwargs={**env_kwargs, "face_motion": "episode", **options.motion_arguments},
+        env_kwargs={**env_kwargs, "face_motion": "episode", **options.face_arguments},
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
@@ -313,7 +318,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         checkpoint=given.checkpoint,
         seeds=options.seeds(FIRST_SEED),
         out=options.out,
-        env_kwargs=options.motion_arguments,
+        env_kwargs=options.face_arguments,
         corruption=None if corruption == trained.corruption else corruption,
         temporal_ensemble=given.temporal_ensemble,
         n_action_steps=given.n_action_steps,

@@ -156,6 +156,7 @@ class EvaluationPlan:
         config: the configuration.
         checkpoint: of the policy.
         env: environment in which the policy acts.
+        xml_hash: of the environment's model.
         execution: of the policy's chunks of actions.
         device: of the network.
     """
@@ -163,6 +164,7 @@ class EvaluationPlan:
     config: EvaluationConfig
     checkpoint: Checkpoint
     env: EnvConfig
+    xml_hash: str
     execution: ActionExecution
     device: torch.device
 
@@ -192,12 +194,12 @@ class EvaluationPlan:
             recorded = {k: v for k, v in recorded.items() if k != "clips"} | {"people": "test"}
         env_kwargs = pin_library({**recorded, **config.env_kwargs})
         env = EnvConfig(checkpoint.env, spec, env_kwargs)
-        _require_fit(checkpoint, env)
+        xml_hash = _require_fit(checkpoint, env)
         if (spec.cameras or config.videos) and (problem := opengl_problem()):
             why = "the policy sees images" if spec.cameras else "--video 0 needs no OpenGL"
             raise RequestError(f"{problem} ({why})")
         execution = choose_execution(checkpoint.execution, config)
-        return cls(config, checkpoint, env, execution, choose_device(config.device))
+        return cls(config, checkpoint, env, xml_hash, execution, choose_device(config.device))
 
     def __str__(self) -> str:
         execution, checkpoint, seeds = self.execution, self.checkpoint, self.config.seeds
@@ -239,7 +241,7 @@ class EvaluationPlan:
             "env": self.env.task.env_id,
             "env_kwargs": without_library_path(self.env.env_kwargs),
             "observation": self.env.spec.to_json(),
-            "xml_hash": self.checkpoint.xml_hash,
+            "xml_hash": self.xml_hash,
             "policy": self.checkpoint.policy,
             "checkpoint": self.checkpoint.content_hash,
             "acting": acting,
@@ -266,7 +268,7 @@ class EvaluationPlan:
             "env_kwargs": kwargs,
             "motion_sha256": library.motion_sha256,
             "prediction_sha256": library.prediction_sha256 if shows_prediction else None,
-            "xml_hash": checkpoint.xml_hash,
+            "xml_hash": self.xml_hash,
             "execution": self.settings["acting"],
             "precision": self.config.precision,
             "device": self.device.type,
@@ -458,24 +460,41 @@ def run_name(checkpoint: Path) -> str:
     return path.name
 
 
-def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> None:
-    """Make sure that the environment is the one that the policy was trained for.
+def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> str:
+    """Return the hash of the environment's model, which is the one that the policy was trained for.
+
+    A policy may be evaluated with another kind of face than it was trained with: the environment
+    with its own face counts then.
 
     Raises:
         RequestError: naming what the checkpoint has and what the environment has.
     """
-    with contextlib.closing(config.make()) as env:
-        world = world_of(env)
-        pairs = {
-            "actions": (", ".join(checkpoint.action_names), ", ".join(world.action_names)),
-            "control period": (checkpoint.control_period, CONTROL_PERIOD),
-            "size of the state": (checkpoint.dims.state, config.vector_size),
-            "model hash": (checkpoint.xml_hash[:12], world.xml_hash[:12]),
-        }
-    for name, (trained, here) in pairs.items():
-        if trained != here:
+    face = checkpoint.dataset.get("env_kwargs", {}).get("face", "visual")
+    own = here = _facts_of_model(config)
+    if here["face"] != face:
+        own = _facts_of_model(config, face=face)
+    pairs = {
+        "actions": (", ".join(checkpoint.action_names), own["actions"]),
+        "control period": (checkpoint.control_period, CONTROL_PERIOD),
+        "size of the state": (checkpoint.dims.state, config.vector_size),
+        "model hash": (checkpoint.xml_hash[:12], own["xml_hash"][:12]),
+    }
+    for name, (trained, found) in pairs.items():
+        if trained != found:
             raise RequestError(
                 f"checkpoint '{checkpoint.folder}' was trained with {name} {trained}; {config.env} "
-                f"has {here} here; install the release that trained it, "
+                f"has {found} here; install the release that trained it, "
                 f"{checkpoint.versions.get('robo_manip_baselines', 'unknown')}, or train again"
             )
+    return here["xml_hash"]
+
+
+def _facts_of_model(config: EnvConfig, **changes: Any) -> dict[str, str]:
+    """Return kind of face, actions and hash of an environment's model."""
+    with contextlib.closing(config.make(**changes)) as env:
+        world = world_of(env)
+        return {
+            "face": world.face_kind,
+            "actions": ", ".join(world.action_names),
+            "xml_hash": world.xml_hash,
+        }

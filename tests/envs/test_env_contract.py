@@ -39,6 +39,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "arms": "both",
         "motion": "recorded+tremor",
     },
+    "physical face": {"obs": "current", "face": "physical", "motion": "recorded+turn_away"},
     "after lift": {"obs": "current", "face_motion": "after_lift"},
 }
 
@@ -136,6 +137,13 @@ def test_info_has_what_every_task_promises(env: gymnasium.Env[Any, Any]) -> None
         assert given["is_success_strict"] is False
         assert given["completion_time"] is None
         assert given["phase"] in world.phase_names
+        assert given["face_contacts"] == ()
+        assert given["face_proximity"] is None
+        assert given["is_refusing"] is (False if "turn_away" in str(world.motion) else None)
+    world.measures_proximity = True
+    near = env.step(env.action_space.sample())[-1]["face_proximity"]
+    np.testing.assert_allclose(near.mouth, world.mouth_track[0], atol=1e-9)
+    np.testing.assert_array_equal(near.grippers[1], world.gripper_position)
 
 
 def test_an_entry_describes_its_environment(name: str) -> None:

@@ -358,6 +358,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "relative": (bool,),
     "arms": (str,),
     "corruption": (dict, type(None)),
+    "face": (str,),
     "face_motion": (str,),
     "motion": (str,),
     "people": (str,),
@@ -461,6 +462,27 @@ FACE_FIELDS = (
         "Distance between the middle of the inner lips, now",
         "m",
         rule="not negative",
+    ),
+    Field(
+        "region_force",
+        ("T", "R", "B"),
+        "Largest normal force between a region of the face and what touches it, in the control "
+        "step of this row's action, all contact points together",
+        "N",
+        dtype="float32",
+        rule="not negative",
+        since=4,
+        is_optional=True,
+    ),
+    Field(
+        "region_impulse",
+        ("T", "R", "B"),
+        "Impulse of the normal force, likewise",
+        "N s",
+        dtype="float32",
+        rule="not negative",
+        since=4,
+        is_optional=True,
     ),
 )
 """Fields that every task with a replayed face records."""

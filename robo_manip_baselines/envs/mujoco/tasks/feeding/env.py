@@ -109,6 +109,8 @@ class FeedingEnv(FaceEnv):
     | ``face_force`` | float | N, the largest normal force between the robot and the face in the
     step |
 
+    and what `FaceEnv` adds for every task.
+
     ## Episode end
 
     Terminates when the cube was delivered (``is_success``) and let go and the gripper has
@@ -130,6 +132,8 @@ class FeedingEnv(FaceEnv):
     ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
     3}``; None shows the truth |
     | ``arms`` | ``"right"`` | right or both |
+    | ``face`` | ``"visual"`` | kind of face: visual, or physical, soft tissue on a head that
+    yields |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
@@ -240,7 +244,7 @@ class FeedingEnv(FaceEnv):
 
     def watch_contacts(self) -> None:
         """Record which fingers touch the cube, and how hard the robot touches the face."""
-        for first, second in self.data.contact.geom.tolist():
+        for first, second in self.touch.pairs:
             if self._cube_geom in (first, second):
                 self._fingers_on_cube |= self._finger_bits[first] | self._finger_bits[second]
         self._face_force = max(self._face_force, self.max_face_force())
