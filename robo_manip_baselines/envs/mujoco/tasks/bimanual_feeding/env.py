@@ -25,7 +25,87 @@ LEFT_HOME_QPOS = (-1.3, *HOME_QPOS[1:])
 
 
 class BimanualFeedingEnv(FeedingEnv):
-    """TODO"""
+    """Fetch a cube with the left hand, pass it to the right one, and bring it to a moving mouth.
+
+    `FeedingEnv` with the cube out of the right arm's reach, beside the left arm's base, and without
+    a left arm that could reach the mouth past the head: one arm cannot do it. Units, frames and
+    rate are those of `FeedingEnv`.
+
+    ## Action space
+
+    ``Box(14,)`` float32, targets of the position servos of both arms, left arm first. Values
+    outside the bounds are clipped to them.
+
+    | num | action | min | max | joint | unit |
+    |---|---|---|---|---|---|
+    | 0, 7 | waist | -pi | pi | left/waist, right/waist | rad |
+    | 1, 8 | shoulder | -1.850 | 1.257 | .../shoulder | rad |
+    | 2, 9 | elbow | -1.763 | 1.606 | .../elbow | rad |
+    | 3, 10 | forearm roll | -pi | pi | .../forearm_roll | rad |
+    | 4, 11 | wrist angle | -1.868 | 2.234 | .../wrist_angle | rad |
+    | 5, 12 | wrist rotate | -pi | pi | .../wrist_rotate | rad |
+    | 6, 13 | gripper, position of a finger | 0.021 (closed) | 0.057 (open) | .../left_finger | m |
+
+    ## Observation space
+
+    That of `FeedingEnv` with ``arms="both"``: ``state`` is (28,), the left arm's 14 elements first.
+    Distances are those from the right gripper to the mouth.
+
+    ## Reward
+
+    1 on the step that first meets ``is_success``, and 1 on the step that first meets
+    ``is_success_strict``; 0 otherwise.
+
+    ## Starting state
+
+    The right arm at home, the left arm at home but turned by -1.3 rad, towards the cube; both
+    grippers open. The cube's centre is uniform in x -0.44 ... -0.34 and y 0.17 ... 0.27, on the
+    table. Mouth and motion are drawn as in `FeedingEnv`.
+
+    The mouth moves for 12 s, which is as long as an episode lasts: from the start
+    (``face_motion="episode"``) or from the moment at which the left hand has lifted the cube
+    (``face_motion="after_lift"``). It never comes to rest within an episode.
+
+    ## Info
+
+    That of `FeedingEnv`, and
+
+    | key | type | content |
+    |---|---|---|
+    | ``is_success`` | bool | after a hand-over, Algorithm 1's condition has been met with the cube
+    held by the right gripper: gripper and mouth less than 0.03 m apart along x, 0.01 m along y,
+    0.01 m along z |
+    | ``is_success_strict`` | bool | ``is_success``, and the cube, of which some finger had kept hold
+    since the lift, was let go with its centre inside the mouth opening; since the lift neither arm
+    has touched lips, face or shoulders |
+    | ``phase`` | str | reach, grasp, pass (lifted, and not yet in the right gripper alone), carry,
+    deliver or release |
+    | ``handover_time`` | float or None | s from the lift until the right gripper alone held the
+    cube; None before, and without a hand-over in the air |
+
+    Either hand may lift the cube. A cube that was dropped before the hand-over and picked up again
+    cannot be handed over any more.
+
+    ## Episode end
+
+    Terminates when the cube was delivered (``is_success``) and let go and the right gripper has
+    withdrawn by 0.12 m, or when the cube falls off the table. Truncated after 600 steps (12 s).
+
+    ## Arguments
+
+    Those of `FeedingEnv`, except
+
+    | name | default | meaning |
+    |---|---|---|
+    | ``arms`` | ``"both"`` | both; ``"right"`` is refused |
+
+    Raises ``RequestError``, a ``ValueError``, when an argument, a seed (0 to 2⁵³ - 1) or an option
+    of ``reset`` (there are none) is not valid.
+
+    ## Version history
+
+    - v0: first release.
+    """
 
     task = ENTRY
     phase_names = ("reach", "grasp", "pass", "carry", "deliver", "release")
@@ -58,16 +138,18 @@ class BimanualFeedingEnv(FeedingEnv):
         return {**info, "handover_time": None if time is None else progress.time_since_lift(time)}
 
     def _hands(self) -> Hands:
-        left, right = self._fingers_on("left"), self._fingers_on("right")
-        return Hands(right == 2, left == 2, right > 0, left > 0)
+        return Hands(self._fingers_on("left"), self._fingers_on("right"))
 
     def _measure(self) -> StepMeasurements:
-        """Return the measurements of feeding, for which either hand may lift the cube."""
+        """Return the measurements of feeding, where either hand may hold the cube.
+
+        Only the right one brings it to the mouth, and only after a hand-over.
+        """
         step, hands = super()._measure(), self._hands()
-        is_brought = hands.right_holds and self.handover.time is not None
+        is_brought = hands.right == 2 and self.handover.time is not None
         return replace(
             step,
-            is_held=hands.right_holds or hands.left_holds,
-            is_touched=hands.right_touches or hands.left_touches,
+            is_held=hands.is_held,
+            is_touched=hands != Hands(),
             is_at_mouth=step.is_at_mouth and is_brought,
         )

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
 class Hands:
-    """Hands on the cube in one control step.
+    """Fingers of each gripper, 0 to 2, that touched the cube in one control step."""
 
-    Attributes:
-        right_holds: both fingers of the right gripper touch the cube.
-        left_holds: likewise of the left one.
-        right_touches: any finger of the right gripper touches it.
-        left_touches: likewise of the left one.
-    """
+    left: int = 0
+    right: int = 0
 
-    right_holds: bool = False
-    left_holds: bool = False
-    right_touches: bool = False
-    left_touches: bool = False
+    @property
+    def is_held(self) -> bool:
+        """Both fingers of a gripper touched it."""
+        return 2 in (self.left, self.right)
 
 
 @dataclass(frozen=True)
@@ -27,10 +23,12 @@ class Handover:
     """Hand-over of the lifted cube from the left gripper to the right, in the air.
 
     Attributes:
-        time: s since the start of the episode at which it was over: the first moment at which the
-            right gripper alone held the cube, which had been lifted and not been let go of.
+        was_left: the left gripper has held the lifted cube, which has not been let go of since.
+        time: s since the start of the episode at which the hand-over was over: the right gripper
+            held the cube and the left one touched it no more.
     """
 
+    was_left: bool = False
     time: float | None = None
 
     def advance(self, time: float, hands: Hands, *, is_carried: bool) -> Handover:
@@ -41,6 +39,8 @@ class Handover:
             hands: on the cube.
             is_carried: the cube was lifted before this step, and has not been let go of since.
         """
-        if self.time is None and is_carried and hands.right_holds and not hands.left_touches:
-            return Handover(time)
-        return self
+        was_left = is_carried and (self.was_left or hands.left == 2)
+        is_over = was_left and hands.right == 2 and not hands.left
+        return replace(
+            self, was_left=was_left, time=time if self.time is None and is_over else self.time
+        )
