@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.scene import CUBE_SIZE
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.tasks.bimanual_feeding import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.bimanual_feeding.success import Handover, Hands
@@ -75,9 +74,9 @@ class BimanualFeedingEnv(FeedingEnv):
     | ``is_success`` | bool | after a hand-over, Algorithm 1's condition has been met with the cube
     held by the right gripper: gripper and mouth less than 0.03 m apart along x, 0.01 m along y,
     0.01 m along z |
-    | ``is_success_strict`` | bool | ``is_success``, and the cube, of which some finger had kept hold
-    since the lift, was let go with its centre inside the mouth opening; since the lift neither arm
-    has touched lips, face or shoulders |
+    | ``is_success_strict`` | bool | ``is_success``, and the cube was let go, for the first time
+    since the lift, with its centre inside the mouth opening; since the lift neither arm has touched
+    lips, face or shoulders |
     | ``phase`` | str | reach, grasp, pass (lifted, and not yet in the right gripper alone), carry,
     deliver or release |
     | ``handover_time`` | float or None | s from the lift until the right gripper alone held the
