@@ -31,20 +31,21 @@ from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import (
     pick_up,
 )
 
-MEETING = np.array([-0.15, 0.14, 0.20])
-"""m, world: where the cube is handed over, to the person's right and below the chin. Both arms
-reach it with 0.05 m to spare for the largest offset of the shoulders, and neither passes between
-the other and the face."""
+MEETING = np.array([-0.19, 0.12, 0.27])
+"""m, world: where the cube is handed over, beside the person and above the right shoulder. Lower or
+nearer, the right gripper, 0.15 m across, brushes the shoulder of a person who leans towards it;
+further away, the left wrist comes to its limit."""
 
 HOLD_DEPTH = 0.02
 """m from the site of the left gripper, which points down, to the cube's centre: its fingers hold
 the upper half of the cube, so that those of the right one find room below and between them."""
 
-BEFORE = 0.12
+BEFORE = 0.20
 """m from where the right gripper takes the cube to where it waits for it, backwards."""
 
-RISE = 0.06
-"""m by which the left gripper goes up once it has let go, out of the right one's fingers."""
+RISE = 0.04
+"""m by which the left gripper goes up once it has let go: its finger tips are then 0.03 m above the
+right one's fingers."""
 
 RETREAT = np.array([0.0, 0.0, 0.05])
 """m, world, by which the right gripper rises as it goes back from the meeting place."""
@@ -166,7 +167,7 @@ class RightHand(PhasedExpert):
         return [
             Reach(ready),
             Wait(lambda: self.giver.phases_done >= HELD_OUT),
-            Reach(at_cube, speed=0.15),
+            Reach(at_cube, speed=0.25),
             Grip(FINGER_CLOSED, 0.4),
             Wait(lambda: self.giver.phases_done >= LET_GO),
             Reach(back),
