@@ -126,8 +126,8 @@ def test_the_left_arm_reaches_the_cube_and_the_place_of_the_hand_over(corner: np
     ]
     for path in (fetch, [*fetch, *carry]):
         missed, turned = reach("left", LEFT_HOME_QPOS, path)
-        # With its forearm turned over, which some ways lead to, the arm stops up to 8 mm and 0.1 rad
-        # short, at the limit of its wrist: the right gripper goes to where the cube is.
+        # With its forearm turned over, which some ways lead to, the arm stops up to 8 mm and 0.1
+        # rad short, at the limit of its wrist: the right gripper goes to where the cube is.
         assert missed < CUBE_SIZE / 4
         assert turned < 0.12  # rad
 
