@@ -15,7 +15,7 @@ from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
-from robo_manip_baselines.policy.presets import Chunk
+from robo_manip_baselines.policy.presets import Chunk, Delay
 from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import require_out_file
@@ -76,6 +76,10 @@ class PolicyOptions:
         temporal_ensemble: Average the predictions of all chunks, whatever the checkpoint says.
         n_action_steps: Execute so many actions of a chunk before the next, whatever the checkpoint
             says.
+        strategy: Execution of chunks: synchronous, naive, ensemble, rtc, rtc_trained or
+            roll_forward; that of the checkpoint if not given.
+        inference_delay: Control steps between an observation and the first action that is made
+            from it.
         device: Device of the network: auto, cpu, cuda or cuda:1.
         precision: fp32, or bf16 for the products inside the network.
         video: Videos to write: of the first successes and the first failures, half of each.
@@ -87,6 +91,8 @@ class PolicyOptions:
     num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
     temporal_ensemble: bool = False
     n_action_steps: Annotated[Chunk | None, tyro.conf.arg(aliases=["--execute"])] = None
+    strategy: str | None = None
+    inference_delay: Delay = 0
     device: str = "auto"
     precision: str = "fp32"
     video: NonNegativeInt = 0
@@ -311,6 +317,8 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         corruption=None if corruption == trained.corruption else corruption,
         temporal_ensemble=given.temporal_ensemble,
         n_action_steps=given.n_action_steps,
+        strategy=given.strategy,
+        inference_delay=given.inference_delay,
         num_envs=given.num_envs,
         workers=options.workers,
         device=given.device,
