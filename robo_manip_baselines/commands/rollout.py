@@ -225,7 +225,7 @@ def to_collection(options: RolloutOptions) -> Collection:
 
     spec, demonstration = options.spec, options.demonstration
     env_kwargs: dict[str, Any] = {"cameras": spec.cameras, "image_size": spec.image_size}
-    if spec.arms != UNTRAINED.arms:
+    if spec.arms != task_entry(options.env).arms[0]:
         env_kwargs["arms"] = spec.arms
     return Collection(
         env=options.env,
@@ -364,6 +364,9 @@ def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | Non
     default = RolloutOptions(tyro.MISSING, spec=spec)
     options = parse(RolloutOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)
     require_consistent(options)
+    if options.scripted and not last_value(args, "arms"):
+        arms = task_entry(options.env).arms[0]
+        options = replace(options, spec=replace(options.spec, arms=arms))
     return options, checkpoint
 
 

@@ -103,7 +103,7 @@ class TrainConfig(Generic[Network]):
 
     def __post_init__(self) -> None:
         require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
-        task_entry(self.env)
+        task_entry(self.env).require_arms(self.spec.arms)
         require_ranges(self)
         if self.training.norm is not None:
             own = policy_entry(self.policy).normalization
@@ -127,11 +127,13 @@ class TrainConfig(Generic[Network]):
         """
         presets = policy_presets(policy)
         chosen = presets[require_choice("preset", preset, presets)]
+        task = task_entry(env)
         spec = ObservationSpec(
             obs="current_pred",
             cameras=chosen.cameras,
             image_size=chosen.image_size,
-            object_pose=chosen.object_pose and bool(task_entry(env).names.objects),
+            object_pose=chosen.object_pose and bool(task.names.objects),
+            arms=task.arms[0],
         )
         config = cls(policy, chosen.config, chosen.training, spec, env, preset=preset)
         return dataclasses.replace(config, **changes)

@@ -165,6 +165,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             arms=arms,
             corruption=_make_corruption(corruption),
         )
+        self.task.require_arms(spec.arms)
         _check_drawing(shadows, multisamples)
         if object_pose and not self.task.names.objects:
             raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")

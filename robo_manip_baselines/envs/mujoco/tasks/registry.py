@@ -19,11 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.observation import Corruption, ObservedNames
+from robo_manip_baselines.observation.spec import ARMS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 NAMESPACE = "robo_manip_baselines"
 
-TASKS = {"FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY"}
+TASKS = {
+    "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
+    "BimanualFeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.bimanual_feeding:ENTRY",
+}
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
 
 
@@ -212,6 +216,7 @@ class TaskEntry:
             one is the default.
         metrics: ``module:class`` of its `EpisodeMetrics`.
         failures: kind of failure -> description.
+        arms: that can do it, of `ObservationSpec.arms`; the first is the default.
         names: of target and objects in observations.
         target_field, predicted_field: fields of an episode that hold the true target and a
             predictor's output for it; ``predicted_field`` is empty where the target is not the
@@ -234,6 +239,7 @@ class TaskEntry:
     metrics: str
     failures: Mapping[str, str]
     version: int = 0
+    arms: tuple[str, ...] = tuple(ARMS)
     names: ObservedNames = field(default_factory=ObservedNames)
     target_field: str = "mouth_position"
     predicted_field: str = "predicted_mouth"
@@ -256,6 +262,17 @@ class TaskEntry:
     def env_id(self) -> str:
         """Registered id of the environment."""
         return f"{NAMESPACE}/{self.name}-v{self.version}"
+
+    def require_arms(self, arms: str) -> None:
+        """Require arms that can do the task.
+
+        Raises:
+            RequestError: they cannot.
+        """
+        if arms not in self.arms:
+            raise RequestError(
+                f"arms {arms}: cannot do {self.name}; valid: {', '.join(sorted(self.arms))}"
+            )
 
     def make_expert(self, name: str, env: Any) -> Expert:
         """Make a scripted expert for an unwrapped environment.

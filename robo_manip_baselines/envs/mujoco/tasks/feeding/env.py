@@ -29,6 +29,10 @@ OFF_TABLE = -0.05
 """m, height of the cube's centre below which it has fallen off the table."""
 
 
+_FINGER_BITS = {"right": (1, 2), "left": (4, 8)}
+"""Bits of the left and the right finger of each arm."""
+
+
 class FeedingEnv(FaceEnv):
     """Pick up a red cube and bring it to the mouth of a head that moves as a person moved.
 
@@ -163,20 +167,23 @@ class FeedingEnv(FaceEnv):
         self._cube_qpos = int(model.joint("cube").qposadr[0])
         self._cube_body = model.body("cube").id
         self._cube_geom = model.geom("cube").id
-        links = [model.body(f"right/{side}_finger_link").id for side in ("left", "right")]
-        # For each geom: bit 0 where it is of the left finger, bit 1 of the right.
-        self._finger_bits = ((model.geom_bodyid == np.array(links)[:, None]).T @ [1, 2]).tolist()
+        # For each geom: bits 0 and 1 where it is of a finger of the right arm, 2 and 3 of the left.
+        self._finger_bits = [_finger_bits(model, geom) for geom in range(model.ngeom)]
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Add the red cube."""
         add_cube(scene)
 
     def reset_task(self, rng: np.random.Generator) -> None:
-        """Put the cube somewhere on the table in front of the head."""
+        """Put the cube where `draw_cube` says, flat on the table."""
         self.progress = FeedingProgress()
         self._clear_contacts()
-        x, y = rng.uniform(CUBE_LOW, CUBE_HIGH)
+        x, y = self.draw_cube(rng)
         self.data.qpos[self._cube_qpos : self._cube_qpos + 7] = (x, y, CUBE_SIZE / 2, 1, 0, 0, 0)
+
+    def draw_cube(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draw where the cube starts, (2,) m, world x and y."""
+        return rng.uniform(CUBE_LOW, CUBE_HIGH)
 
     def object_position(self) -> NDArray[np.float64]:
         """(1, 3) m, world: centre of the cube."""
@@ -253,16 +260,28 @@ class FeedingEnv(FaceEnv):
         self._fingers_on_cube = 0
         self._face_force = 0.0
 
+    def _fingers_on(self, arm: str) -> int:
+        """Return how many fingers of an arm touched the cube in the last step."""
+        return sum(bool(self._fingers_on_cube & bit) for bit in _FINGER_BITS[arm])
+
     def _measure(self) -> StepMeasurements:
         mouth, gripper = self.mouth_track[0], self.gripper_position
         half_width, half_height = self.mouth_opening.tolist()
         return StepMeasurements(
             time=self.time,
-            is_held=self._fingers_on_cube == 0b11,
-            is_touched=self._fingers_on_cube != 0,
+            is_held=self._fingers_on("right") == 2,
+            is_touched=self._fingers_on("right") > 0,
             cube_height=float(self.cube_position[2]),
             is_at_mouth=is_at_mouth(gripper, mouth),
             is_inside_mouth=is_inside_mouth(self.cube_offset, half_width, half_height),
             touches_face=self._face_force > 0.0,
             gripper_distance=float(np.linalg.norm(gripper - mouth)),
         )
+
+
+def _finger_bits(model: mujoco.MjModel, geom: int) -> int:
+    """Return the bit of the finger that a geom belongs to; 0 if it is of none."""
+    body = model.body(int(model.geom_bodyid[geom])).name
+    arm, _, link = body.partition("/")
+    fingers = ("left_finger_link", "right_finger_link")
+    return _FINGER_BITS[arm][fingers.index(link)] if link in fingers else 0
