@@ -224,6 +224,8 @@ class TaskEntry:
         completion_time: description of the interval that ``completion_time`` measures.
         success_time_limit: s after which a success counts as late in tables; None for no limit.
         study: ``module:name`` of its `TaskStudy`; empty without one.
+        goal_env: ``module:class`` of a goal-conditioned view of it, for reinforcement learning;
+            empty without one. Commands do not take it.
         schema_version: lowest version of the episode schema that describes its files.
     """
 
@@ -246,6 +248,7 @@ class TaskEntry:
     completion_time: str = "from the start to success"
     success_time_limit: float | None = None
     study: str = ""
+    goal_env: str = ""
     schema_version: int = 3
 
     def __post_init__(self) -> None:
@@ -256,6 +259,11 @@ class TaskEntry:
     def env_id(self) -> str:
         """Registered id of the environment."""
         return f"{NAMESPACE}/{self.name}-v{self.version}"
+
+    @property
+    def goal_env_id(self) -> str:
+        """Registered id of the goal-conditioned view, if there is one."""
+        return f"{NAMESPACE}/{self.name.removesuffix('Env')}GoalEnv-v{self.version}"
 
     def make_expert(self, name: str, env: Any) -> Expert:
         """Make a scripted expert for an unwrapped environment.
@@ -330,12 +338,16 @@ def entry_of_id(env_id: str) -> TaskEntry:
 
 
 def register_envs(names: Sequence[str] | None = None) -> None:
-    """Register the environments of tasks with Gymnasium; all of them if no names are given."""
+    """Register the environments of tasks, and goal-conditioned views of them, with Gymnasium.
+
+    Those of all tasks, if no names are given.
+    """
     for name in task_names() if names is None else names:
         entry = task_entry(name)
-        if entry.env_id not in gymnasium.registry:
-            limit = entry.max_episode_steps
-            gymnasium.register(entry.env_id, entry_point=entry.env, max_episode_steps=limit)
+        for env_id, env in ((entry.env_id, entry.env), (entry.goal_env_id, entry.goal_env)):
+            if env and env_id not in gymnasium.registry:
+                limit = entry.max_episode_steps
+                gymnasium.register(env_id, entry_point=env, max_episode_steps=limit)
 
 
 def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
