@@ -228,7 +228,7 @@ class FeedingGoalEnv(GoalEnv):
         """MuJoCo's state of it."""
         return self.feeding.data
 
-    def reset(
+    def reset(  # type: ignore[override]  # the return type of GoalEnv's is not declared
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
         """Start an episode; every random choice comes from ``seed``.
