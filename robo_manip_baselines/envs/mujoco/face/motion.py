@@ -315,7 +315,7 @@ class MotionLibrary:
 
 
 PREDICTION = "predicted_mouth"
-"""(N, H, 3), the one array that a library may lack."""
+"""(N, H, 3), an array that a library may lack."""
 
 LIBRARY_FILE = FileType(
     "recorded_face_motion",
@@ -331,6 +331,9 @@ LIBRARY_FILE = FileType(
         "run_clip": ArrayType("U", ("R",)),
         "run_subject": ArrayType("U", ("R",)),
         PREDICTION: ArrayType("f", ("N", "H", 3), is_optional=True),
+        # Marks of spliced runs, for whoever analyses results.
+        "blended": ArrayType("b", ("N",), is_optional=True),
+        "mirrored": ArrayType("b", ("N",), is_optional=True),
         "metadata": ArrayType("U"),
     },
     # A day at 30 frames a second, in runs of a second.
