@@ -33,7 +33,12 @@ from robo_manip_baselines.runs.npz import (
 )
 from robo_manip_baselines.runs.seeds import stream_generator
 
-DEFAULT_LIBRARY = Path(__file__).with_name("assets") / "face_motion.npz"
+_ASSETS = Path(__file__).with_name("assets")
+
+DEFAULT_LIBRARY = _ASSETS / "face_motion.npz"
+
+LIBRARIES = {"extended": _ASSETS / "face_motion_extended.npz"}
+"""Name of a library that ships beside the default one -> its file."""
 
 SEGMENT_DURATION = 12.0
 """Seconds of recorded motion replayed in an episode (paper, section IV.C)."""
@@ -146,12 +151,12 @@ class MotionLibrary:
         """Read a library written by ``face_prediction export-motion``.
 
         Args:
-            path: the file; the one that ships with the package if None.
+            path: the file, or a name of `LIBRARIES`; the one that ships with the package if None.
 
         Raises:
             RequestError: the file is missing, damaged or of another schema.
         """
-        source = Path(path) if path is not None else DEFAULT_LIBRARY
+        source = library_file(path) or DEFAULT_LIBRARY
         content = read_library(source)
         return cls(
             fps=float(content["fps"]),
@@ -341,6 +346,14 @@ LIBRARY_FILE = FileType(
     quaternion_tolerance=1e-3,
 )
 """Arrays of a library file."""
+
+
+def library_file(given: Path | str | None) -> Path | None:
+    """Return the file of a library that is given by its path or by a name of `LIBRARIES`.
+
+    A file of such a name is given as ``./extended``.
+    """
+    return None if given is None else LIBRARIES.get(str(given), Path(given))
 
 
 def read_library(path: Path) -> Arrays:

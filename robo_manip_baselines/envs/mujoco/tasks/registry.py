@@ -420,25 +420,34 @@ def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
 
 
 @cache
-def _shipped_library() -> str:
-    """Digest of the motion library that ships with the package."""
-    from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary  # the simulator, too
+def _shipped_libraries() -> dict[str, str]:
+    """Map the digests of the motion libraries that ship with the package to their names."""
+    from robo_manip_baselines.envs.mujoco.face.motion import (  # the simulator, too
+        LIBRARIES,
+        MotionLibrary,
+    )
 
-    return MotionLibrary.load().sha256
+    return {MotionLibrary.load(name).sha256: name or "" for name in (None, *LIBRARIES)}
 
 
 def without_library_path(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments of an environment that name the motion library by its content alone.
 
     A path tells nothing where files may be replaced or moved. Without a path, the library is the
-    one that ships with the package. The path stays where older releases recorded no digest.
+    one that ships with the package; others that ship keep, or get, their names. The path stays
+    where older releases recorded no digest.
     """
     kwargs = dict(env_kwargs)
     if kwargs.get("motion_library") and not kwargs.get("motion_sha256"):
         return kwargs
     kwargs.pop("motion_library", None)
     sha256 = kwargs.pop("motion_sha256", None)
-    return kwargs if sha256 in (None, _shipped_library()) else {**kwargs, "motion_sha256": sha256}
+    if sha256 is None:
+        return kwargs
+    name = _shipped_libraries().get(sha256)
+    if name == "":
+        return kwargs
+    return {**kwargs, **({"motion_library": name} if name else {}), "motion_sha256": sha256}
 
 
 FACE_FIELDS = (
