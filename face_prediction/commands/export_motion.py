@@ -11,9 +11,11 @@ import tyro
 from face_prediction.motion.library import (
     MOTION_LIBRARY,
     lift_clips,
+    load_motion,
     record_motion,
     save_motion,
     track_files,
+    with_base,
     with_people,
 )
 from face_prediction.motion.motion import MotionSettings
@@ -46,6 +48,8 @@ class ExportMotionOptions:
             --splice, those of the spliced runs, between marks of their own.
         test_people: Subjects of evaluation; all others are those of demonstrations, and the library
             stores both. If none is given, environments split people by a rule of their own.
+        base: Older library of the same clips: its runs are taken as they are, bit for bit, and new
+            ones, with --splice, come after them. Forecasts in it are left out.
         settings: Settings of the motion.
         splicing: --splice joins what is left of each person's clips to further runs, which come
             last; each sample says whether it is a blend and whether it is played backwards.
@@ -56,6 +60,7 @@ class ExportMotionOptions:
     attribution: Path | None = None
     report: Path | None = None
     test_people: tuple[str, ...] = ()
+    base: Path | None = None
     settings: tyro.conf.OmitArgPrefixes[MotionSettings] = field(default_factory=MotionSettings)
     splicing: tyro.conf.OmitArgPrefixes[SpliceSettings] = field(default_factory=SpliceSettings)
 
@@ -66,17 +71,19 @@ def run_export_motion(options: ExportMotionOptions) -> None:
     Raises:
         RequestError: a track or the table cannot be used, or no run is left.
     """
-    inputs = [*options.tracks, options.attribution]
+    inputs = [*options.tracks, options.attribution, options.base]
     is_spliced = options.splicing.splice
     if options.report is not None:
         names = [] if is_spliced else [path.stem for path in track_files(options.tracks)]
         require_report(options.report, [*inputs, options.out], names, is_spliced)
     require_out_file(options.out, MOTION_LIBRARY, inputs)
+    base = None if options.base is None else load_motion(options.base)
     clips, withheld = lift_clips(options.tracks, options.attribution, options.settings)
     parts = [(clip.row.clip, clip.row.subject, clip.motion) for clip in clips]
     spliced = splice_clips(parts, options.splicing, options.settings) if is_spliced else []
     library = record_motion(clips, options.settings, withheld, spliced, options.splicing)
     library = with_people(library, options.test_people)
+    library = library if base is None else with_base(library, base)
     if options.report is not None and is_spliced:  # whose names are known only now
         require_report(options.report, inputs, [clip.name for clip in spliced], is_spliced)
     save_motion(options.out, library)

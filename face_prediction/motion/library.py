@@ -31,6 +31,12 @@ from robo_manip_baselines.runs.npz import ArrayType, FileType, read_json_array, 
 SCHEMA = "recorded_face_motion"
 VERSION = 1
 
+SAME_MOTION = 2e-4
+"""m, and elements of quaternions, by which two extractions of one video may differ: ten times what
+two machines differ by (MediaPipe 0.10.30, 24 µm)."""
+
+_MOTION = ("mouth", "orientation", "jaw")
+
 CAMERA_MODEL = (
     f"pinhole, {VERTICAL_FOV_DEGREES:g} degrees vertical field of view (assumed), principal point "
     "in the middle of the image, square pixels; origin at the camera, x right in the image, y up, "
@@ -269,6 +275,30 @@ def record_motion(
         blended=np.concatenate([before, *(clip.kept(clip.blended) for clip in spliced)]),
         mirrored=np.concatenate([before, *(clip.kept(clip.mirrored) for clip in spliced)]),
     )
+
+
+def with_base(library: RecordedMotion, base: RecordedMotion) -> RecordedMotion:
+    """Put the runs of an older library, as they are, in place of the first runs of a new one.
+
+    The detector's numbers differ in the last digits from machine to machine; what was recorded
+    with the older library keeps its meaning only with the same ones.
+
+    Raises:
+        RequestError: the new library does not begin with the same motion, to `SAME_MOTION`.
+    """
+    frames, runs = len(base.time), len(base.run_start)
+    same = all(
+        np.array_equal(getattr(base, name), getattr(library, name)[:runs])
+        for name in ("run_clip", "run_subject", "run_length")
+    )
+    arrays = {name: (getattr(base, name), getattr(library, name)) for name in _MOTION}
+    if not same or any(
+        not np.allclose(old, new[:frames], rtol=0.0, atol=SAME_MOTION)
+        for old, new in arrays.values()
+    ):
+        raise RequestError("--base: these tracks give other runs; name those that it was made from")
+    joined = {name: np.concatenate([old, new[frames:]]) for name, (old, new) in arrays.items()}
+    return replace(library, **joined)
 
 
 def joint_attribution(clip: SplicedClip, clips: Sequence[LiftedClip]) -> dict[str, str]:

@@ -49,7 +49,7 @@ class SpliceSettings:
     search: Positive = 0.3
     min_stretch: Positive = 1.25
     max_turn: Positive = 12.0
-    max_spliced: Positive = 90.0
+    max_spliced: Positive = 75.0
 
     def __post_init__(self) -> None:
         require_ranges(self, "--{} {}")
