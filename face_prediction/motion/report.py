@@ -70,6 +70,7 @@ def splice_tables(library: RecordedMotion) -> str:
             len(row["stretches"]),
             f"{100 * row['blended']:.0f} %",
             f"{100 * row['mirrored']:.0f} %",
+            ", ".join(f"{_largest(row, key):.0f}" for key in ("gap_mm", "turn_degrees")),
             " ".join(f"{value:.2f}" for value in row["tremor_mm"]),
             f"{row['speed_median_cm_s']:.1f}, {row['speed_p95_cm_s']:.1f}",
         )
@@ -78,6 +79,7 @@ def splice_tables(library: RecordedMotion) -> str:
     attribution = library.metadata["attribution"]
     sources = [(n, attribution[n]["licence"], attribution[n]["source"]) for n in splices]
     head = ("clip", "subject", "kept s", "runs", "clips", "stretches", "blended", "backwards")
+    head = (*head, "largest gap mm, turn °")
     lines = [
         f"{library.seconds:.1f} s in {len(library.run_start)} runs, of {len(shares)} people, at "
         f"{library.fps:g} frames a second. {extremes(library)}",
@@ -168,6 +170,11 @@ def extremes(library: RecordedMotion) -> str:
         f"The most that is kept: mouth across the view {most[0]:.2f} m/s and {most[1]:.1f} m/s², "
         f"head {most[2]:.0f}°/s, jaw {most[3]:.2f} m/s, head turned {most[4]:.0f}° away."
     )
+
+
+def _largest(row: Mapping[str, Any], key: str) -> float:
+    """Largest difference of mouths or heads at the blends of a spliced clip; 0 without a blend."""
+    return max((stretch.get(key, 0.0) for stretch in row["stretches"]), default=0.0)
 
 
 def read_page(path: Path, marks: tuple[str, str] = (BEGIN, END)) -> str:

@@ -10,7 +10,7 @@ Legend: T frames, B frames of a blend, W frames of the search for its place.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,7 @@ class SpliceSettings:
         search: Seconds at either end of a stretch within which a blend is placed.
         min_stretch: Seconds of the shortest stretch that is used.
         max_turn: Degrees between two heads that are blended, on average.
+        max_gap: Metres between two mouths that are blended, on average.
         max_spliced: Seconds of spliced motion of one person, at most.
     """
 
@@ -49,7 +50,8 @@ class SpliceSettings:
     search: Positive = 0.3
     min_stretch: Positive = 1.25
     max_turn: Positive = 12.0
-    max_spliced: Positive = 75.0
+    max_gap: Positive = 0.03
+    max_spliced: Positive = 72.0
 
     def __post_init__(self) -> None:
         require_ranges(self, "--{} {}")
@@ -99,12 +101,14 @@ class Join:
         leave: frame of the first stretch at which the blend begins.
         enter: frame of the second one, likewise.
         turn: degrees between the two heads, mean over the blend.
+        gap: m between the two mouths, likewise.
         cost: of differences in pose and velocity, see `best_join`.
     """
 
     leave: int
     enter: int
     turn: float
+    gap: float
     cost: float
 
 
@@ -118,7 +122,8 @@ class SplicedClip:
         motion: as if it had been one clip, cut into runs by the same limits.
         blended: (T,) bool: the sample is a blend of two recorded ones.
         mirrored: (T,) bool: the sample, or one of the two, is played backwards.
-        stretches: clip, first frame, number of frames and direction of all that was joined.
+        stretches: clip, first frame, number of frames and direction of all that was joined, and
+            by how much mouth and head differed, on average, where they were blended into.
     """
 
     name: str
@@ -152,9 +157,9 @@ def best_join(
 ) -> Join | None:
     """Find where two stretches are most alike; None where there is no room for a blend.
 
-    The cost of a place is the mean over the blend of the squared differences of head (in 5
-    degrees), velocity of the mouth (in 0.05 m/s) and jaw (in 3 mm), each a small one that is seen.
-    Where the mouth is does not count, as the second stretch is moved to the first.
+    The cost of a place is the mean over the blend of the squared differences of mouth (in 5 mm),
+    its velocity (in 0.05 m/s), head (in 5 degrees) and jaw (in 3 mm), each a small one that is
+    seen.
 
     Args:
         first: stretch that is left.
@@ -173,45 +178,54 @@ def best_join(
     a = leaves[:, None, None] + np.arange(blend + 1)
     b = enters[None, :, None] + np.arange(blend + 1)
     turn = np.degrees(rotation_angle(first.orientation[a], second.orientation[b]))
-    slower, faster = (np.gradient(s.mouth, axis=0) * fps for s in (first, second))
-    speed = np.linalg.norm(slower[a] - faster[b], axis=-1)
+    gap = np.linalg.norm(first.mouth[a] - second.mouth[b], axis=-1)
+    leaving, entering = (np.gradient(s.mouth, axis=0) * fps for s in (first, second))
+    speed = np.linalg.norm(leaving[a] - entering[b], axis=-1)
     jaw = first.jaw[a] - second.jaw[b]
-    cost = np.mean((turn / 5.0) ** 2 + (speed / 0.05) ** 2 + (jaw / 0.003) ** 2, axis=-1)
-    row, column = np.unravel_index(int(np.argmin(cost)), cost.shape)
-    mean_turn = float(turn.mean(axis=-1)[row, column])
-    return Join(int(leaves[row]), int(enters[column]), mean_turn, float(cost[row, column]))
+    small = ((gap, 0.005), (speed, 0.05), (turn, 5.0), (jaw, 0.003))
+    cost = np.mean(sum((value / unit) ** 2 for value, unit in small), axis=-1)
+    place = np.unravel_index(int(np.argmin(cost)), cost.shape)
+    return Join(
+        leave=int(leaves[place[0]]),
+        enter=int(enters[place[1]]),
+        turn=float(turn.mean(axis=-1)[place]),
+        gap=float(gap.mean(axis=-1)[place]),
+        cost=float(cost[place]),
+    )
 
 
 class _Chain:
     """Stretches joined so far: mouth, orientation, jaw, and the two marks of each sample."""
 
     def __init__(self, first: Stretch, blend: int) -> None:
-        self.blend, self.begin, self.stretches = blend, blend, [first]
+        self.blend, self.begin = blend, blend
+        self.stretches: list[Stretch] = [first]
+        self.joins: list[Join | None] = [None]
         self.parts = [*first.arrays, np.zeros(len(first.jaw), dtype=bool), first.marks]
 
     def __len__(self) -> int:
         return len(self.parts[0])
 
     def append(self, stretch: Stretch, join: Join) -> None:
-        """Blend into another stretch, moved to where the mouth is."""
+        """Blend into another stretch."""
         blend, last = self.blend, self.stretches[-1]
         start = len(self) - len(last.jaw) + join.leave
         ahead = slice(join.enter, join.enter + blend + 1)
         old = [part[start : start + blend + 1] for part in self.parts]
-        moved = stretch.mouth + np.mean(old[0] - stretch.mouth[ahead], axis=0)
         weight = smooth_step(np.arange(blend + 1) / blend)
         joined = [
-            old[0] + weight[:, None] * (moved[ahead] - old[0]),
+            (1 - weight[:, None]) * old[0] + weight[:, None] * stretch.mouth[ahead],
             slerp(old[1], stretch.orientation[ahead], weight),
-            old[2] + weight * (stretch.jaw[ahead] - old[2]),
+            (1 - weight) * old[2] + weight * stretch.jaw[ahead],
             (weight > 0) & (weight < 1),
             np.where(weight < 1, old[4], False) | np.where(weight > 0, stretch.marks[ahead], False),
         ]
-        after = [moved, stretch.orientation, stretch.jaw, np.zeros_like(stretch.marks)]
-        rest = [part[ahead.stop :] for part in (*after, stretch.marks)]
+        after = (*stretch.arrays, np.zeros_like(stretch.marks), stretch.marks)
+        rest = [part[ahead.stop :] for part in after]
         parts = zip(self.parts, joined, rest, strict=True)
         self.parts = [np.concatenate([part[:start], new, end]) for part, new, end in parts]
         self.stretches.append(stretch)
+        self.joins.append(join)
         self.begin = join.enter + 2 * blend  # between two blends, as much is as recorded
 
 
@@ -235,7 +249,9 @@ def join_stretches(given: Sequence[Stretch], settings: SpliceSettings, fps: floa
                 fitting = [
                     (join.cost, number, join)
                     for number, join in enumerate(joins)
-                    if join is not None and join.turn <= settings.max_turn
+                    if join is not None
+                    and join.turn <= settings.max_turn
+                    and join.gap <= settings.max_gap
                 ]
                 if fitting:
                     _, number, join = min(fitting, key=lambda item: item[:2])
@@ -264,6 +280,9 @@ def splice_clips(
         given = [s for name, motion in own for s in _left_over(name, motion, settings)]
         if not given:
             continue
+        # Takes have the person elsewhere before the camera: all are moved to the first one's place.
+        middle = given[0].mouth.mean(axis=0)
+        given = [replace(s, mouth=s.mouth - s.mouth.mean(axis=0) + middle) for s in given]
         fps = own[0][1].fps
         window = round(cuts.min_run * fps) + 1
         chains = join_stretches(given, settings, fps)
@@ -314,8 +333,11 @@ def _cut(
         window=window,
         runs=cut_runs(mouth, quality, window, cuts.max_displacement),
     )
-    records = [
-        {"clip": s.clip, "first": s.first, "frames": len(s.jaw), "mirrored": s.is_mirrored}
-        for s in chain.stretches
-    ]
+    records: list[dict[str, Any]] = []
+    for stretch, join in zip(chain.stretches, chain.joins, strict=True):
+        record = {"clip": stretch.clip, "first": stretch.first, "frames": len(stretch.jaw)}
+        record["mirrored"] = stretch.is_mirrored
+        if join is not None:
+            record |= {"gap_mm": round(1000 * join.gap, 1), "turn_degrees": round(join.turn, 1)}
+        records.append(record)
     return SplicedClip(name, person, motion, blended, mirrored, records)
