@@ -49,7 +49,8 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> lis
 
 def splice_tables(library: RecordedMotion) -> str:
     """Markdown of a library with spliced runs: total, people, spliced runs, and attribution."""
-    splices: dict[str, dict[str, Any]] = library.metadata["splices"]
+    stored: dict[str, dict[str, Any]] = library.metadata["splices"]
+    splices = {name: stored[name] for name in library.run_clip.tolist() if name in stored}
     subjects, seconds = library.run_subject.tolist(), (library.run_length - 1) / library.fps
     clips = library.run_clip.tolist()
     shares = []

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -196,6 +198,15 @@ def test_the_expert_reaches_the_goal() -> None:
     env.close()
 
 
+def test_random_actions_explore(grasped: Any) -> None:
+    """Noise moves the cube by more than the tolerance, and does not lose it."""
+    for seed in range(3):
+        cubes = np.stack([step[0]["achieved_goal"] for step in wander(grasped, seed, steps=100)])
+        assert np.ptp(cubes, axis=0).max() > 0.06
+        held = cubes[-1] - grasped.feeding.gripper_position
+        assert np.linalg.norm(held) == pytest.approx(GRASP_OFFSET, abs=5e-3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -224,6 +235,26 @@ def test_an_action_of_the_wrong_shape_or_not_finite_changes_nothing(grasped: Any
 
 def test_commands_do_not_take_it() -> None:
     assert "FeedingGoalEnv" not in task_names()
+
+
+def test_the_page_shows_the_example(repository: Path) -> None:
+    page = (repository / "docs" / "reinforcement-learning.md").read_text(encoding="utf-8")
+    script = (repository / "docs" / "train_sac_her.py").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```python\n(model = SAC.*?)```", page, re.DOTALL)
+    assert textwrap.indent(shown, "    ") in script
+    sentence = page.partition("Its options are ")[2].partition(".")[0]
+    assert set(re.findall(r"`(--\w+)`", sentence)) == set(re.findall(r'"(--\w+)"', script))
+
+
+def test_the_page_runs(repository: Path) -> None:
+    page = (repository / "docs" / "reinforcement-learning.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```python\n(import gymnasium.*?)```", page, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(shown, names)
+    names["env"].close()
+    for line in shown.splitlines():
+        expression, sign, result = line.partition("  # ")
+        assert not sign or eval(expression, names) == eval(result), line
 
 
 @pytest.mark.slow
