@@ -1,4 +1,4 @@
-"""Recorded face motion: the library that ships with the package, and segments drawn from it.
+"""Recorded face motion: the libraries that ship with the package, and segments drawn from them.
 
 Shapes: N frames of the whole library, R runs, M frames of a segment, H frames of a prediction,
 ``...`` any shape of times.
@@ -362,7 +362,10 @@ def read_library(path: Path) -> Arrays:
     Raises:
         RequestError: the file is missing, damaged or of another schema.
     """
-    remedy = "make one with 'python -m face_prediction export-motion' or leave the option out"
+    remedy = (
+        "make one with 'python -m face_prediction export-motion', leave the option out, or take "
+        f"one that ships: {', '.join(LIBRARIES)}"
+    )
     name = f"motion library '{path}'"
     if not path.is_file():
         raise RequestError(f"{name} does not exist; {remedy}")

@@ -139,8 +139,8 @@ class FeedingEnv(FaceEnv):
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
     | ``people`` | ``"all"`` | all, or train or test: different people, drawn before their starts |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
-    | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
-    None |
+    | ``motion_library`` | None | a file of ``face_prediction export-motion``, or ``"extended"``,
+    the shipped one with more people; the shipped one of recordings alone if None |
     | ``motion_sha256`` | None | digest of the library's motion; any if None |
     | ``shadows``, ``multisamples`` | False, 0 | prettier and slower images, for videos |
     | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;
