@@ -51,19 +51,16 @@ def splice_tables(library: RecordedMotion) -> str:
     """Markdown of a library with spliced runs: total, people, spliced runs, and attribution."""
     stored: dict[str, dict[str, Any]] = library.metadata["splices"]
     splices = {name: stored[name] for name in library.run_clip.tolist() if name in stored}
-    subjects, seconds = library.run_subject.tolist(), (library.run_length - 1) / library.fps
-    clips = library.run_clip.tolist()
-    shares = []
-    for person in dict.fromkeys(subjects):
-        own = [
-            (s, clip)
-            for s, clip, who in zip(seconds, clips, subjects, strict=True)
-            if who == person
-        ]
-        total = float(sum(s for s, _ in own))
-        spliced = float(sum(s for s, clip in own if clip in splices))
+    seconds = (library.run_length - 1) / library.fps
+    starts = library.run_length - round(library.metadata["settings"]["min_run"] * library.fps)
+    is_spliced = np.isin(library.run_clip, list(splices))
+    people = []
+    for person in dict.fromkeys(library.run_subject.tolist()):
+        own = library.run_subject == person
+        total, made = float(seconds[own].sum()), float(seconds[own & is_spliced].sum())
         share = f"{100 * total / library.seconds:.0f} %"
-        shares.append((person, f"{total:.1f}", f"{spliced:.1f}", len(own), share))
+        row = (person, f"{total:.1f}", f"{made:.1f}", int(own.sum()), int(starts[own].sum()), share)
+        people.append(row)
     rows = [
         (
             *(name, row["subject"], f"{row['seconds']:.1f}", row["runs"]),
@@ -82,10 +79,10 @@ def splice_tables(library: RecordedMotion) -> str:
     head = ("clip", "subject", "kept s", "runs", "clips", "stretches", "blended", "backwards")
     head = (*head, "largest gap mm, turn °")
     lines = [
-        f"{library.seconds:.1f} s in {len(library.run_start)} runs, of {len(shares)} people, at "
+        f"{library.seconds:.1f} s in {len(library.run_start)} runs, of {len(people)} people, at "
         f"{library.fps:g} frames a second. {extremes(library)}",
         "",
-        *markdown_table(("subject", "s", "of it spliced s", "runs", "share"), shares),
+        *markdown_table(("subject", "s", "of it spliced s", "runs", "starts", "share"), people),
         "",
         *markdown_table((*head, "tremor x, y, z mm", "speed median, 95 % cm/s"), rows),
         "",
