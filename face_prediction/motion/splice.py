@@ -41,7 +41,8 @@ class SpliceSettings:
         min_stretch: Seconds of the shortest stretch that is used.
         max_turn: Degrees between two heads that are blended, on average.
         max_gap: Metres between two mouths that are blended, on average.
-        max_spliced: Seconds of spliced motion of one person, at most.
+        max_spliced: Seconds of spliced motion of one person, at most; by default so many that
+            nobody makes up more than a fifth of the library that ships.
     """
 
     splice: bool = False
@@ -235,7 +236,7 @@ def join_stretches(given: Sequence[Stretch], settings: SpliceSettings, fps: floa
     The first one begins; the one that fits best follows. A mirrored one follows where none
     forwards fits; where none fits at all, the next chain begins.
     """
-    blend, search = round(settings.blend * fps), round(settings.search * fps)
+    blend, search = max(round(settings.blend * fps), 1), round(settings.search * fps)
     left = list(given)
     turned = [stretch.mirrored() for stretch in given] if settings.mirror else []
     chains: list[_Chain] = []

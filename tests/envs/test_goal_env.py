@@ -233,6 +233,16 @@ def test_an_action_of_the_wrong_shape_or_not_finite_changes_nothing(grasped: Any
     assert np.isfinite(grasped.step(np.zeros(6))[0]["observation"]).all()
 
 
+@pytest.mark.gl
+def test_it_renders() -> None:
+    env = gymnasium.make(ENV_ID, start="grasped", render_mode="rgb_array", render_size=(48, 64))
+    env.reset(seed=0)
+    image: Any = env.render()
+    assert (image.shape, image.dtype) == ((48, 64, 3), np.uint8)
+    assert image.std() > 10  # not blank
+    env.close()
+
+
 def test_commands_do_not_take_it() -> None:
     assert "FeedingGoalEnv" not in task_names()
 

@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from face_prediction.commands.predict import require_same_motion
 from face_prediction.motion.library import RecordedMotion, load_motion
+from face_prediction.motion.motion import MotionSettings
 from face_prediction.motion.report import BEGIN, END, SPLICE_MARKS, splice_tables, tables
 from face_prediction.tracking.geometry import rotation_angle
+from robo_manip_baselines.runs.errors import RequestError
 
 WINDOW = 361  # 12 s at 30 frames a second
 REACH = 0.08  # m on each axis
@@ -164,3 +167,8 @@ def test_marks_of_spliced_runs_are_true(recorded: RecordedMotion, extended: Reco
         # Each stretch at most once in each direction.
         used = [(s["clip"], s["first"], s["mirrored"]) for s in row["stretches"]]
         assert len(set(used)) == len(used)
+
+
+def test_spliced_runs_are_not_forecast(extended: RecordedMotion) -> None:
+    with pytest.raises(RequestError, match="has spliced runs, of which there is no track"):
+        require_same_motion(extended, [], MotionSettings())

@@ -146,6 +146,13 @@ def test_mouths_that_are_too_far_apart_are_not_joined() -> None:
     assert [len(chain) for chain in chains] == [80, 80]
 
 
+def test_a_blend_shorter_than_a_frame_is_a_cut() -> None:
+    settings = replace(SETTINGS, blend=0.001)
+    (chain,) = join_stretches([stretch("a", 60, 0.0), stretch("b", 60, 0.1)], settings, FPS)
+    assert not chain.parts[3].any()
+    assert np.isfinite(chain.parts[0]).all()
+
+
 def test_no_more_than_is_wanted_of_one_person() -> None:
     stretches = [stretch(str(i), 90, 0.1 * i) for i in range(10)]
     (chain,) = join_stretches(stretches, replace(SETTINGS, max_spliced=6.0), FPS)
