@@ -155,6 +155,10 @@ def require_same_motion(
     given: RecordedMotion, clips: Sequence[LiftedClip], settings: MotionSettings
 ) -> None:
     """Raise RequestError if a clip of a library is missing, or it was made from other tracks."""
+    if given.blended is not None:
+        raise RequestError(
+            "--library: has spliced runs, of which there is no track; make it without --splice"
+        )
     missing = sorted(set(given.run_clip.tolist()) - {clip.row.clip for clip in clips})
     if missing:
         clip_names = ", ".join(missing)

@@ -21,6 +21,7 @@ from face_prediction.motion.motion import (
     lift,
     step_tremor,
 )
+from face_prediction.motion.splice import SplicedClip, SpliceSettings
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES, continuous_quaternions
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -29,6 +30,12 @@ from robo_manip_baselines.runs.npz import ArrayType, FileType, read_json_array, 
 
 SCHEMA = "recorded_face_motion"
 VERSION = 1
+
+SAME_MOTION = 2e-4
+"""m, and elements of quaternions, by which two extractions of one video may differ: ten times what
+two machines differ by (MediaPipe 0.10.30, 24 µm)."""
+
+_MOTION = ("mouth", "orientation", "jaw")
 
 CAMERA_MODEL = (
     f"pinhole, {VERTICAL_FOV_DEGREES:g} degrees vertical field of view (assumed), principal point "
@@ -59,6 +66,8 @@ LIBRARY_FILE = FileType(
         "run_subject": ArrayType("U", ("R",)),
         "metadata": ArrayType("U"),
         "predicted_mouth": ArrayType("f", ("N", "H", 3), is_optional=True),
+        "blended": ArrayType("b", ("N",), is_optional=True),
+        "mirrored": ArrayType("b", ("N",), is_optional=True),
     },
     # A day at 30 frames a second, in runs of a second; ten seconds ahead.
     limits={"N": 2_592_000, "R": 86_400, "H": 300},
@@ -176,6 +185,8 @@ class RecordedMotion:
         metadata: what the library was made of, how, and what was cut.
         predicted_mouth: (N, H, 3) float32 m: forecasts of the mouth 1 ... H frames after each
             frame, in the frame of ``mouth``; None: no forecasts.
+        blended: (N,) bool: the sample is a blend of two recorded ones; None: none is.
+        mirrored: (N,) bool: the sample is played backwards, see `SplicedClip`; None: none is.
     """
 
     fps: float
@@ -189,6 +200,8 @@ class RecordedMotion:
     run_subject: np.ndarray
     metadata: dict[str, Any]
     predicted_mouth: np.ndarray | None = None
+    blended: np.ndarray | None = None
+    mirrored: np.ndarray | None = None
 
     @property
     def seconds(self) -> float:
@@ -222,15 +235,21 @@ class RecordedMotion:
 
 
 def record_motion(
-    clips: Sequence[LiftedClip], settings: MotionSettings, withheld: int
+    clips: Sequence[LiftedClip],
+    settings: MotionSettings,
+    withheld: int,
+    spliced: Sequence[SplicedClip] = (),
+    splicing: SpliceSettings | None = None,
 ) -> RecordedMotion:
     """Put the runs of clips into a library, with their attribution and what was cut.
+
+    Those of spliced clips, made with the settings ``splicing``, come last.
 
     Raises:
         RequestError: no clip has a run, or the clips differ in rate.
     """
     detectors = [clip.detector for clip in clips]
-    metadata = {
+    metadata: dict[str, Any] = {
         "camera_model": CAMERA_MODEL,
         "head_pose": HEAD_POSE,
         "mouth": MOUTH_MODEL,
@@ -241,7 +260,61 @@ def record_motion(
         "withheld_clips": withheld,
         "versions": {"numpy": np.__version__, "library_schema": VERSION},
     }
-    return join_runs([(c.row.clip, c.row.subject, c.motion) for c in clips], metadata)
+    parts = [(c.row.clip, c.row.subject, c.motion) for c in clips]
+    if not spliced:
+        return join_runs(parts, metadata)
+    if taken := {clip.name for clip in spliced} & set(metadata["clips"]):
+        raise RequestError(f"--splice: a clip is named '{taken.pop()}' already; rename its track")
+    metadata["attribution"] |= {clip.name: joint_attribution(clip, clips) for clip in spliced}
+    metadata["splices"] = {clip.name: splice_statistics(clip) for clip in spliced}
+    metadata["splice_settings"] = None if splicing is None else asdict(splicing)
+    library = join_runs([*parts, *((c.name, c.subject, c.motion) for c in spliced)], metadata)
+    before = np.zeros(sum(stop - start for c in clips for start, stop in c.motion.runs), dtype=bool)
+    return replace(
+        library,
+        blended=np.concatenate([before, *(clip.kept(clip.blended) for clip in spliced)]),
+        mirrored=np.concatenate([before, *(clip.kept(clip.mirrored) for clip in spliced)]),
+    )
+
+
+def with_base(library: RecordedMotion, base: RecordedMotion) -> RecordedMotion:
+    """Put the runs of an older library, as they are, in place of the first runs of a new one.
+
+    The detector's numbers differ in the last digits from machine to machine; what was recorded
+    with the older library keeps its meaning only with the same ones.
+
+    Raises:
+        RequestError: the new library does not begin with the same motion, to `SAME_MOTION`.
+    """
+    frames, runs = len(base.time), len(base.run_start)
+    same = all(
+        np.array_equal(getattr(base, name), getattr(library, name)[:runs])
+        for name in ("run_clip", "run_subject", "run_length")
+    )
+    arrays = {name: (getattr(base, name), getattr(library, name)) for name in _MOTION}
+    if not same or any(
+        not np.allclose(old, new[:frames], rtol=0.0, atol=SAME_MOTION)
+        for old, new in arrays.values()
+    ):
+        raise RequestError("--base: these tracks give other runs; name those that it was made from")
+    joined = {name: np.concatenate([old, new[frames:]]) for name, (old, new) in arrays.items()}
+    return replace(library, **joined)
+
+
+def joint_attribution(clip: SplicedClip, clips: Sequence[LiftedClip]) -> dict[str, str]:
+    """Subject, licences and sources of the clips that a spliced one is made of."""
+    rows = [other.row.record() for other in clips if other.row.clip in clip.clips]
+    return {key: "; ".join(dict.fromkeys(row[key] for row in rows)) for key in rows[0]}
+
+
+def splice_statistics(clip: SplicedClip) -> dict[str, Any]:
+    """Stretches of a spliced clip, and what its runs are like."""
+    return {
+        **motion_statistics(clip.motion, clip.subject),
+        "blended": round(float(np.mean(clip.kept(clip.blended))), 3),
+        "mirrored": round(float(np.mean(clip.kept(clip.mirrored))), 3),
+        "stretches": clip.stretches,
+    }
 
 
 def with_people(library: RecordedMotion, test: Sequence[str]) -> RecordedMotion:

@@ -274,10 +274,6 @@ def lift(track: FaceTrack, settings: MotionSettings) -> ClipMotion:
         if cutoff is not None:
             mouth[part] = smooth_depth(mouth[part], cutoff / track.fps)
     window = round(settings.min_run * track.fps) + 1
-    runs: list[tuple[int, int]] = []
-    for start, stop in quality.facing_segments():
-        permitted = permitted_starts(mouth[start:stop], window, settings.max_displacement)
-        runs += [(start + a, start + b) for a, b in longest_runs(permitted, window)]
     return ClipMotion(
         fps=track.fps,
         timestamps=track.timestamps,
@@ -288,8 +284,26 @@ def lift(track: FaceTrack, settings: MotionSettings) -> ClipMotion:
         quality=quality,
         depth_smoothed=cutoff is not None,
         window=window,
-        runs=runs,
+        runs=cut_runs(mouth, quality, window, settings.max_displacement),
     )
+
+
+def cut_runs(
+    mouth: np.ndarray, quality: Quality, window: int, max_displacement: float
+) -> list[tuple[int, int]]:
+    """[start, stop) of the runs to keep of a motion, see `longest_runs`.
+
+    Args:
+        mouth: (T, 3) m.
+        quality: of its frames and steps.
+        window: frames of an episode.
+        max_displacement: m, reach on each axis from where an episode starts.
+    """
+    runs: list[tuple[int, int]] = []
+    for start, stop in quality.facing_segments():
+        permitted = permitted_starts(mouth[start:stop], window, max_displacement)
+        runs += [(start + a, start + b) for a, b in longest_runs(permitted, window)]
+    return runs
 
 
 def step_tremor(depth: np.ndarray) -> float:

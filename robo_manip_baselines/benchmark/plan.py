@@ -17,7 +17,7 @@ from robo_manip_baselines.benchmark.conditions import (
 from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, WorkItem
 from robo_manip_baselines.benchmark.worker import LIBRARY, STATS
 from robo_manip_baselines.envs.mujoco.face import FACES
-from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, library_file
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
@@ -362,7 +362,7 @@ def make_plan(
         env: name of the task.
         conditions: to train and evaluate.
         preset: the size.
-        library: of recorded motion; the one that ships with the package if None.
+        library: of recorded motion, or the name of one that ships; the default one if None.
         error_stats: of drawn errors; those that ship with the package if None.
         headline: end point of the benchmark.
         people: in demonstrations and evaluation.
@@ -372,7 +372,7 @@ def make_plan(
         RequestError: a file cannot be used, a condition needs predictions that the library lacks or
             errors further ahead than the statistics go, or its people cannot be split.
     """
-    motion = MotionLibrary.load(library)
+    motion, file = MotionLibrary.load(library), library_file(library)
     for condition in conditions:
         if parse_motion(condition.motion).recorded:
             for part in (people.demonstrations, people.evaluation):
@@ -392,7 +392,7 @@ def make_plan(
         env,
         preset,
         tuple(condition.for_task(task_entry(env)) for condition in conditions),
-        library and library.resolve(),
+        file and file.resolve(),
         error_stats and error_stats.resolve(),
         headline,
         people,

@@ -84,7 +84,7 @@ class BenchmarkOptions:
             (steps=200); docs/training.md lists them.
         device: Device of the networks: cpu or cuda; as in the preset if not given.
         face: Kind of face: visual or physical; as in the file of conditions if not given.
-        motion_library: File of recorded face motion; the one that ships with the package if not
+        motion_library: File of recorded face motion, or extended; the one that ships if not
             given.
         error_stats: File of error statistics; the one that ships with the package if not given.
         reference: Condition that tables compare the others with; current if not given, or the first

@@ -58,7 +58,7 @@ class ForesightOptions:
         preset: Size: cpu (half an hour on two cores), full (an hour and a half, more motions,
             delays and forecasters) or smoke (half a minute).
         num_episodes: Episodes of each cell, seeds from 0; as in the preset if not given.
-        motion_library: File of recorded face motion; the one that ships with the package if not
+        motion_library: File of recorded face motion, or extended; the one that ships if not
             given.
         num_workers: Processes; as many as there are cores if not given. Results do not depend on
             it.

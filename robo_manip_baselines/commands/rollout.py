@@ -119,8 +119,8 @@ class RolloutOptions:
         people: People who move: all, or train or test for demonstrations and evaluation with
             different people. If not given, all, and test for a policy that learnt from train.
         clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
-        motion_library: File of recorded face motion; if not given, the one that ships with the
-            package, or that of the demonstrations.
+        motion_library: File of recorded face motion, or extended, which ships, too, and has more
+            people. If not given, the one that ships, or that of the demonstrations.
         workers: Processes in which environments step; with --policy, 0 steps them in the main one.
         spec: Observation. With --scripted, cameras and image_size are recorded; with --policy, the
             observation is that of the checkpoint, and options are checked against it.

@@ -23,7 +23,7 @@ def install_command(extra: str, source: Path = PACKAGE.parent) -> str:
     requirements of the extra by name.
 
     Args:
-        extra: ``train``, ``face-prediction``, ``ray`` or ``dev``.
+        extra: ``train``, ``face-prediction``, ``ray``, ``rl`` or ``dev``.
         source: folder that holds the package, the root of a checkout or ``site-packages``.
     """
     if (source / "pyproject.toml").is_file():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, MotionSegment
+from robo_manip_baselines.envs.mujoco.face.motion import (
+    LIBRARIES,
+    MotionLibrary,
+    MotionSegment,
+    library_file,
+    pin_library,
+)
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, without_library_path
 from robo_manip_baselines.runs.errors import RequestError
 
 FPS = 30.0
@@ -213,3 +222,63 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="'jaw' holds Python objects") as caught:
         MotionLibrary.load(path)
     assert "allow_pickle" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def extended() -> MotionLibrary:
+    return MotionLibrary.load("extended")
+
+
+def test_a_library_that_ships_is_loaded_by_its_name(extended: MotionLibrary) -> None:
+    assert library_file("extended") == LIBRARIES["extended"] == library_file(Path("extended"))
+    assert extended.sha256 == MotionLibrary.load(LIBRARIES["extended"]).sha256
+    assert extended.predicted is None
+    with pytest.raises(RequestError, match=r"'extnded' does not exist; .*one that ships: extended"):
+        MotionLibrary.load("extnded")
+
+
+def test_the_extended_library_holds_the_default_one(extended: MotionLibrary) -> None:
+    default = MotionLibrary.load()
+    frames, runs = len(default.mouth), len(default.run_start)
+    np.testing.assert_array_equal(extended.mouth[:frames], default.mouth)
+    assert extended.run_clip[:runs] == default.run_clip
+    # A seed finds another start in it, and so the digests differ.
+    assert extended.motion_sha256 != default.motion_sha256
+
+
+@pytest.mark.parametrize("people", ["train", "test"])
+def test_the_people_of_the_extended_library_are_all_drawn(
+    extended: MotionLibrary, people: str
+) -> None:
+    part = extended.part(people)
+    rng = np.random.default_rng(0)
+    drawn = [part.draw(rng).subject for _ in range(150)]
+    # Of 6 or 7 people drawn uniformly, one is missed in 150 draws with odds below 1e-8.
+    assert set(drawn) == set(part.run_subject)
+    before = set(MotionLibrary.load().part(people).run_subject)
+    assert before < set(part.run_subject)
+
+
+def test_the_default_library_is_the_one_of_published_results() -> None:
+    """Its digest is that of results, datasets and checkpoints made before the extended one came."""
+    assert MotionLibrary.load().motion_sha256.startswith("1dba6fd2fb3a6a4a")
+    assert MotionLibrary.load().sha256.startswith("e132ac5990046f74")
+
+
+def test_what_was_recorded_with_a_library_that_ships_names_it(extended: MotionLibrary) -> None:
+    path, sha256 = str(LIBRARIES["extended"]), extended.sha256
+    named = {"motion_library": "extended", "motion_sha256": sha256}
+    assert pin_library({"motion_library": "extended"}) == named
+    assert without_library_path(named) == named
+    assert without_library_path({"motion_library": path, "motion_sha256": sha256}) == named
+    default = MotionLibrary.load().sha256
+    assert without_library_path({"motion_sha256": default}) == {}
+    with contextlib.closing(make_env("FeedingEnv", cameras=(), people="test", **named)) as env:
+        env.reset(seed=0)
+        assert world_of(env).segment.clip in extended.run_clip
+
+
+def test_the_extended_library_has_no_forecasts_to_show() -> None:
+    arguments: dict[str, Any] = {"obs": "current_pred", "corruption": {"error": "model"}}
+    with pytest.raises(RequestError, match="holds no predicted mouth"):
+        make_env("FeedingEnv", cameras=(), motion_library="extended", **arguments)

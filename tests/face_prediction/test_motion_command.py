@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from face_prediction.motion.library import load_motion
+from face_prediction.motion.library import load_motion, save_motion
 from face_prediction.motion.report import BEGIN, END
 from face_prediction.tracking.tracks import save_track
 
@@ -42,9 +43,9 @@ def folder(tmp_path: Path, make_track) -> Path:
 def run(folder: Path, caplog, exit_code):
     caplog.set_level(logging.INFO)
 
-    def export(*arguments: object, tracks: Path | None = None) -> int:
+    def export(*arguments: object, tracks: Path | None = None, min_run: int = 1) -> int:
         words = ["export-motion", str(tracks or folder / "tracks"), *map(str, arguments)]
-        return exit_code([*words, "--out", str(folder / "motion.npz"), "--min_run", "1"])
+        return exit_code([*words, "--out", str(folder / "motion.npz"), "--min_run", str(min_run)])
 
     return export
 
@@ -168,3 +169,39 @@ def test_other_files_are_not_overwritten(folder: Path, run, caplog) -> None:
     assert run("--report", page) == 2
     assert page.read_text() == "a page without marks"
     assert not (folder / "motion.npz").exists()
+
+
+def test_what_is_left_over_is_spliced(folder: Path, run) -> None:
+    """Clips of 100 frames of one person, too short alone for runs of 4 s, give one together."""
+    page = folder / "docs" / "page.md"
+    table = ("--attribution", folder / "clips.csv", "--report", page)
+    assert run(*table, min_run=4) == 2  # no run is long enough
+    (folder / "clips.csv").write_text(TABLE.replace("ann", "bob"))
+    assert run(*table, "--splice", min_run=4) == 0
+    library = load_motion(folder / "motion.npz")
+    assert library.run_clip.tolist() == ["bob_spliced"]
+    assert library.blended is not None
+    assert library.blended.any()
+    assert library.mirrored is not None
+    assert not library.mirrored.any()
+    splice = library.metadata["splices"]["bob_spliced"]
+    assert {stretch["clip"] for stretch in splice["stretches"]} == {"lively", "steady"}
+    assert library.metadata["attribution"]["bob_spliced"] == {
+        "subject": "bob", "licence": "CC BY 4.0; MIT", "source": "there; here",
+    }  # fmt: skip
+    text = page.read_text()
+    assert "| bob_spliced | CC BY 4.0; MIT | there; here |" in text
+    assert (page.parent / "images" / "motion_bob_spliced.png").is_file()
+
+
+def test_runs_of_a_base_come_first_as_they_are(folder: Path, run, caplog) -> None:
+    table = ("--attribution", folder / "clips.csv")
+    assert run(*table) == 0
+    older = load_motion(folder / "motion.npz")
+    nudged = replace(older, mouth=older.mouth + np.float32(1e-5))  # another machine's last digits
+    save_motion(folder / "base.npz", nudged)
+    assert run(*table, "--base", folder / "base.npz", "--splice", "--min_stretch", "9") == 0
+    np.testing.assert_array_equal(load_motion(folder / "motion.npz").mouth, nudged.mouth)
+    save_motion(folder / "base.npz", replace(older, mouth=older.mouth + np.float32(1e-3)))
+    assert run(*table, "--base", folder / "base.npz") == 2
+    assert "--base: these tracks give other runs" in caplog.text

@@ -29,6 +29,9 @@ OF_TORCH = (
     "robo_manip_baselines.training",
 )
 
+# On gymnasium-robotics, of the extra ``rl``.
+OF_ROBOTICS = ("robo_manip_baselines.envs.mujoco.tasks.feeding.goal_env",)
+
 IMPORT_ALL = """
 import importlib, pkgutil, sys
 package = importlib.import_module({package!r})
@@ -76,7 +79,7 @@ def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
 
 @pytest.mark.parametrize("package", ["robo_manip_baselines", "face_prediction"])
 def test_every_other_module_imports_without_opengl_torch_and_mediapipe(package: str) -> None:
-    loaded = modules_after(IMPORT_ALL.format(package=package, left_out=OF_TORCH))
+    loaded = modules_after(IMPORT_ALL.format(package=package, left_out=OF_TORCH + OF_ROBOTICS))
     assert loaded & (HEAVY | GRAPHICS) == set()
 
 

@@ -1,4 +1,4 @@
-"""Recorded face motion: the library that ships with the package, and segments drawn from it.
+"""Recorded face motion: the libraries that ship with the package, and segments drawn from them.
 
 Shapes: N frames of the whole library, R runs, M frames of a segment, H frames of a prediction,
 ``...`` any shape of times.
@@ -33,7 +33,12 @@ from robo_manip_baselines.runs.npz import (
 )
 from robo_manip_baselines.runs.seeds import stream_generator
 
-DEFAULT_LIBRARY = Path(__file__).with_name("assets") / "face_motion.npz"
+_ASSETS = Path(__file__).with_name("assets")
+
+DEFAULT_LIBRARY = _ASSETS / "face_motion.npz"
+
+LIBRARIES = {"extended": _ASSETS / "face_motion_extended.npz"}
+"""Name of a library that ships beside the default one -> its file."""
 
 SEGMENT_DURATION = 12.0
 """Seconds of recorded motion replayed in an episode (paper, section IV.C)."""
@@ -146,12 +151,12 @@ class MotionLibrary:
         """Read a library written by ``face_prediction export-motion``.
 
         Args:
-            path: the file; the one that ships with the package if None.
+            path: the file, or a name of `LIBRARIES`; the one that ships with the package if None.
 
         Raises:
             RequestError: the file is missing, damaged or of another schema.
         """
-        source = Path(path) if path is not None else DEFAULT_LIBRARY
+        source = library_file(path) or DEFAULT_LIBRARY
         content = read_library(source)
         return cls(
             fps=float(content["fps"]),
@@ -315,7 +320,7 @@ class MotionLibrary:
 
 
 PREDICTION = "predicted_mouth"
-"""(N, H, 3), the one array that a library may lack."""
+"""(N, H, 3), an array that a library may lack."""
 
 LIBRARY_FILE = FileType(
     "recorded_face_motion",
@@ -331,6 +336,9 @@ LIBRARY_FILE = FileType(
         "run_clip": ArrayType("U", ("R",)),
         "run_subject": ArrayType("U", ("R",)),
         PREDICTION: ArrayType("f", ("N", "H", 3), is_optional=True),
+        # Marks of spliced runs, for whoever analyses results.
+        "blended": ArrayType("b", ("N",), is_optional=True),
+        "mirrored": ArrayType("b", ("N",), is_optional=True),
         "metadata": ArrayType("U"),
     },
     # A day at 30 frames a second, in runs of a second.
@@ -340,13 +348,24 @@ LIBRARY_FILE = FileType(
 """Arrays of a library file."""
 
 
+def library_file(given: Path | str | None) -> Path | None:
+    """Return the file of a library that is given by its path or by a name of `LIBRARIES`.
+
+    A file of such a name is given as ``./extended``.
+    """
+    return None if given is None else LIBRARIES.get(str(given), Path(given))
+
+
 def read_library(path: Path) -> Arrays:
     """Read and check the arrays of a library file.
 
     Raises:
         RequestError: the file is missing, damaged or of another schema.
     """
-    remedy = "make one with 'python -m face_prediction export-motion' or leave the option out"
+    remedy = (
+        "make one with 'python -m face_prediction export-motion', leave the option out, or take "
+        f"one that ships: {', '.join(LIBRARIES)}"
+    )
     name = f"motion library '{path}'"
     if not path.is_file():
         raise RequestError(f"{name} does not exist; {remedy}")

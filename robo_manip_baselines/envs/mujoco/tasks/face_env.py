@@ -99,7 +99,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         people: who moves: ``all``, or ``train`` or ``test`` for demonstrations and evaluation with
             different people, see `MotionLibrary.part`.
         clips: ids of recorded clips to draw from; all if None.
-        motion_library: file of ``face_prediction export-motion``; the shipped one if None.
+        motion_library: file of ``face_prediction export-motion``, or a name of `LIBRARIES`; the
+            shipped one if None.
         motion_sha256: digest of the library's motion (`MotionLibrary.sha256`); any if None.
         shadows, multisamples: prettier and slower images, for videos.
         render_mode: ``rgb_array`` or ``human`` (MuJoCo's viewer).

@@ -229,6 +229,8 @@ class TaskEntry:
         completion_time: description of the interval that ``completion_time`` measures.
         success_time_limit: s after which a success counts as late in tables; None for no limit.
         study: ``module:name`` of its `TaskStudy`; empty without one.
+        goal_env: ``module:class`` of a goal-conditioned view of it, for reinforcement learning;
+            empty without one. Commands do not take it.
         schema_version: lowest version of the episode schema that describes its files.
     """
 
@@ -252,6 +254,7 @@ class TaskEntry:
     completion_time: str = "from the start to success"
     success_time_limit: float | None = None
     study: str = ""
+    goal_env: str = ""
     schema_version: int = 3
 
     def __post_init__(self) -> None:
@@ -262,6 +265,11 @@ class TaskEntry:
     def env_id(self) -> str:
         """Registered id of the environment."""
         return f"{NAMESPACE}/{self.name}-v{self.version}"
+
+    @property
+    def goal_env_id(self) -> str:
+        """Registered id of the goal-conditioned view, if there is one."""
+        return f"{NAMESPACE}/{self.name.removesuffix('Env')}GoalEnv-v{self.version}"
 
     def require_arms(self, arms: str) -> None:
         """Require arms that can do the task.
@@ -347,12 +355,16 @@ def entry_of_id(env_id: str) -> TaskEntry:
 
 
 def register_envs(names: Sequence[str] | None = None) -> None:
-    """Register the environments of tasks with Gymnasium; all of them if no names are given."""
+    """Register the environments of tasks, and goal-conditioned views of them, with Gymnasium.
+
+    Those of all tasks, if no names are given.
+    """
     for name in task_names() if names is None else names:
         entry = task_entry(name)
-        if entry.env_id not in gymnasium.registry:
-            limit = entry.max_episode_steps
-            gymnasium.register(entry.env_id, entry_point=entry.env, max_episode_steps=limit)
+        for env_id, env in ((entry.env_id, entry.env), (entry.goal_env_id, entry.goal_env)):
+            if env and env_id not in gymnasium.registry:
+                limit = entry.max_episode_steps
+                gymnasium.register(env_id, entry_point=env, max_episode_steps=limit)
 
 
 def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
@@ -426,25 +438,34 @@ def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
 
 
 @cache
-def _shipped_library() -> str:
-    """Digest of the motion library that ships with the package."""
-    from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary  # the simulator, too
+def _shipped_libraries() -> dict[str, str]:
+    """Map the digests of the motion libraries that ship with the package to their names."""
+    from robo_manip_baselines.envs.mujoco.face.motion import (  # the simulator, too
+        LIBRARIES,
+        MotionLibrary,
+    )
 
-    return MotionLibrary.load().sha256
+    return {MotionLibrary.load(name).sha256: name or "" for name in (None, *LIBRARIES)}
 
 
 def without_library_path(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments of an environment that name the motion library by its content alone.
 
     A path tells nothing where files may be replaced or moved. Without a path, the library is the
-    one that ships with the package. The path stays where older releases recorded no digest.
+    one that ships with the package; others that ship keep, or get, their names. The path stays
+    where older releases recorded no digest.
     """
     kwargs = dict(env_kwargs)
     if kwargs.get("motion_library") and not kwargs.get("motion_sha256"):
         return kwargs
     kwargs.pop("motion_library", None)
     sha256 = kwargs.pop("motion_sha256", None)
-    return kwargs if sha256 in (None, _shipped_library()) else {**kwargs, "motion_sha256": sha256}
+    if sha256 is None:
+        return kwargs
+    name = _shipped_libraries().get(sha256)
+    if name == "":
+        return kwargs
+    return {**kwargs, **({"motion_library": name} if name else {}), "motion_sha256": sha256}
 
 
 FACE_FIELDS = (

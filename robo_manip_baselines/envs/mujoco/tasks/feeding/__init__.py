@@ -124,5 +124,6 @@ ENTRY = TaskEntry(
     completion_time="from the lift to success",
     success_time_limit=APPROACH_LIMIT,
     study=f"{_PACKAGE}.paper:STUDY",
+    goal_env=f"{_PACKAGE}.goal_env:FeedingGoalEnv",
     schema_version=1,
 )

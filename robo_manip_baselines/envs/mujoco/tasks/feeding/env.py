@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import CUBE_SIZE, add_cube
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
@@ -27,6 +28,9 @@ to 0.2, y 0.4 to 0.6), far enough from the chin for a gripper that comes from ab
 
 OFF_TABLE = -0.05
 """m, height of the cube's centre below which it has fallen off the table."""
+
+SETTLING_STEPS = 100
+"""Physics steps, 0.2 s, in which the fingers close on a cube that is put between them."""
 
 
 _FINGER_BITS = {"right": (1, 2), "left": (4, 8)}
@@ -143,8 +147,8 @@ class FeedingEnv(FaceEnv):
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
     | ``people`` | ``"all"`` | all, or train or test: different people, drawn before their starts |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
-    | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
-    None |
+    | ``motion_library`` | None | a file of ``face_prediction export-motion``, or ``"extended"``,
+    the shipped one with more people; the shipped one of recordings alone if None |
     | ``motion_sha256`` | None | digest of the library's motion; any if None |
     | ``shadows``, ``multisamples`` | False, 0 | prettier and slower images, for videos |
     | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;
@@ -184,6 +188,23 @@ class FeedingEnv(FaceEnv):
     def draw_cube(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw where the cube starts, (2,) m, world x and y."""
         return rng.uniform(CUBE_LOW, CUBE_HIGH)
+
+    def hold_cube(self, joints: NDArray[np.float64], offset: float) -> None:
+        """Go on, after a reset, with the cube in the closed gripper of the right arm.
+
+        Args:
+            joints: (6,) rad.
+            offset: m from the gripper site to the cube's centre, along the fingers.
+        """
+        self._set_arm("right", joints.tolist(), FINGER_CLOSED + CUBE_SIZE / 2)
+        self.data.actuator("right/gripper").ctrl = FINGER_CLOSED
+        mujoco.mj_kinematics(self.model, self.data)
+        forward = self.data.site("right/gripper").xmat.reshape(3, 3)[:, 0]
+        place = self.gripper_position + offset * forward
+        pose = (*place, *self.gripper_orientation)
+        self.data.qpos[self._cube_qpos : self._cube_qpos + 7] = pose
+        mujoco.mj_step(self.model, self.data, SETTLING_STEPS)
+        mujoco.mj_forward(self.model, self.data)
 
     def object_position(self) -> NDArray[np.float64]:
         """(1, 3) m, world: centre of the cube."""
