@@ -25,7 +25,7 @@ from robo_manip_baselines.envs.mujoco.tasks.drinking.liquid import (
 Floats = NDArray[np.float64]
 
 BODY_RADIUS: Final = 0.025
-BODY_HEIGHT: Final = 0.070
+BODY_HEIGHT: Final = 0.055
 """m, outside of the body, a cylinder about the origin of the cup's frame. Open fingers are 72 mm
 apart, which leaves 11 mm on either side."""
 

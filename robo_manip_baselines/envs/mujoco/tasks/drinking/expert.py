@@ -30,7 +30,7 @@ GRASP_PITCH = 0.10
 """rad, the gripper's nose down while it holds the upright cup: level, the wrist would be at its
 limit over cups near the base; steeper, the arm would not reach a far mouth with a tilted cup."""
 
-GRASP_HEIGHT = 0.005
+GRASP_HEIGHT = 0.008
 """m, of the gripper above the middle of the cup: nearer to the table its bar would scrape."""
 
 CLEARANCE = 0.10
@@ -42,9 +42,9 @@ LIFT = 0.12
 STANDOFF = np.array([0.10, 0.0, 0.0])
 """m from the mouth to the spout where the approach starts, straight in front of it."""
 
-AT_LIPS = np.array([0.004, 0.0, 0.0])
-"""m from the mouth to the spout while the person drinks: 6 mm past the front of the lips, as far
-as spouts are taken in, and on the lower lip."""
+AT_LIPS = np.array([-0.004, 0.0, 0.0])
+"""m from the mouth to the spout while the person drinks: 14 mm past the front of the lips, in the
+middle of where it delivers."""
 
 AWAY = np.array([0.16, 0.0, 0.0])
 """m from the mouth to the spout at the end."""

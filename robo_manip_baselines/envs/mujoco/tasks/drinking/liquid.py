@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 CAVITY_RADIUS = 0.023
-CAVITY_HEIGHT = 0.066
+CAVITY_HEIGHT = 0.051
 """m, the inside of the body, an upright cylinder about the origin of its frame."""
 
-SPOUT_TIP = np.array([0.070, 0.0, 0.015])
-"""m, centre of the spout's opening: as far out as the spouts of feeding cups, and above the level
-of a serving by so much that it takes a tilt of 20 degrees to pour."""
+SPOUT_TIP = np.array([0.072, 0.0, 0.0225])
+"""m, centre of the spout's opening: so far out that the nose has room beside the tilted body, and
+above the level of a serving by so much that it takes a tilt of 19 degrees to pour."""
 
-SPOUT_ROOT = np.array([0.021, 0.0, -0.024])
+SPOUT_ROOT = np.array([0.021, 0.0, -0.0165])
 """m, where the spout leaves the body, near its foot."""
 
 SPOUT_AXIS = (SPOUT_TIP - SPOUT_ROOT) / np.linalg.norm(SPOUT_TIP - SPOUT_ROOT)
@@ -46,14 +46,14 @@ GRAVITY = 9.81
 def _parcels(count: int) -> Floats:
     """Return (N, 3) m, centres of equal parts of the cavity.
 
-    They are spread evenly in height, area and angle by the additive recurrence of Roberts (2018),
-    which has no rows that a level surface would meet all at once.
+    Heights are equally spaced; area and angle follow the additive recurrence of Roberts (2018),
+    which leaves neither gaps nor rows that a level surface would meet all at once.
     """
-    golden = 1.2207440846057596  # the root of x⁴ = x + 1
-    steps = golden ** -np.arange(1.0, 4.0)
-    height, area, turn = ((0.5 + np.outer(np.arange(count), steps)) % 1.0).T
-    radius, angle = CAVITY_RADIUS * np.sqrt(area), 2.0 * np.pi * turn
-    z = CAVITY_HEIGHT * (height - 0.5)
+    number = np.arange(count)
+    plastic = 1.324717957244746  # the root of x³ = x + 1
+    radius = CAVITY_RADIUS * np.sqrt((0.5 + number / plastic) % 1.0)
+    angle = 2.0 * np.pi * (0.5 + number / plastic**2)
+    z = CAVITY_HEIGHT * ((number + 0.5) / count - 0.5)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
@@ -66,8 +66,8 @@ CAPACITY = np.pi * CAVITY_RADIUS**2 * CAVITY_HEIGHT
 def surface_height(volume: float, up: Floats) -> float:
     """Return m, the height of the liquid's surface along ``up`` from the origin of the cup.
 
-    That is the height below which the cavity holds the volume, found among 2000 equal parts of it;
-    -inf for no liquid.
+    That is the height below which the cavity holds the volume, found among 2000 equal parts of it
+    (to 1.5 % of a serving); -inf for no liquid.
 
     Args:
         volume: m³, 0 to `CAPACITY`.

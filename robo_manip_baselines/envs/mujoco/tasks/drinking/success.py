@@ -24,7 +24,7 @@ more wets the clothes."""
 
 GENTLE_FORCE = float(FORCE_LIMITS[1])
 """N that the spout may press with under the strict condition. A spout rests on the lower lip, so
-that touching is part of drinking; Assistive Gym penalises a tool that presses with 10 N or more, and
+that touching is part of drinking. Assistive Gym penalises a tool that presses with 10 N or more;
 ISO/TS 15066 limits a robot's steady force on the muscles of the jaw to 65 N."""
 
 LIFT_HEIGHT = 0.10
