@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_OPEN, HOME_QPOS
+from robo_manip_baselines.envs.mujoco.expert.servo import ServoConfig
 from robo_manip_baselines.envs.mujoco.tasks.drinking import ENTRY
+from robo_manip_baselines.envs.mujoco.tasks.drinking.cup import SLICES
 from robo_manip_baselines.envs.mujoco.tasks.drinking.env import CUP_HIGH, CUP_LOW, DrinkingEnv
 from robo_manip_baselines.envs.mujoco.tasks.drinking.expert import (
     POUR_TILT,
@@ -18,7 +20,12 @@ from robo_manip_baselines.envs.mujoco.tasks.drinking.expert import (
     holding,
     spout_of,
 )
-from robo_manip_baselines.envs.mujoco.tasks.drinking.liquid import SERVING, SPOUT_AXIS
+from robo_manip_baselines.envs.mujoco.tasks.drinking.liquid import (
+    CAVITY_HEIGHT,
+    SERVING,
+    SPOUT_AXIS,
+    surface_height,
+)
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 
 STAY_OPEN = np.array([*HOME_QPOS, FINGER_OPEN], dtype=np.float32)
@@ -106,12 +113,11 @@ def test_a_cup_that_falls_over_spills(world: DrinkingEnv) -> None:
     assert info["spilled"] > 0.1  # it comes to rest on its spout, which is then half way up
 
 
-def test_the_spout_is_felt_on_the_lips(world: DrinkingEnv) -> None:
-    forces, lip = [], world.mouth.half_height + 0.003
-    for _ in range(3):
-        put_cup(world, world.mouth_track[0] + [0.0, 0.0, -lip], 0.3)
-        forces.append(world.step(STAY_OPEN)[4]["face_force"])
-    assert max(forces) > 0.5
+def test_cup_and_spout_are_felt_by_the_face(world: DrinkingEnv) -> None:
+    """The spout on the lower lip, the body against the nose; and not from afar."""
+    for offset in ((-0.02, 0.0, -world.mouth.half_height - 0.007), (-0.03, 0.0, 0.01)):
+        put_cup(world, world.mouth_track[0] + offset, 0.3)
+        assert world.step(STAY_OPEN)[4]["face_force"] > 0.1  # N
     put_cup(world, world.mouth_track[0] + [0.004, 0.0, 0.0], 0.3)
     assert world.step(STAY_OPEN)[4]["face_force"] == 0.0
 
@@ -150,14 +156,12 @@ def test_experts_let_the_person_drink(world: DrinkingEnv, expert: str) -> None:
     assert terminated
     assert (info["is_success"], info["is_success_strict"], rewards) == (True, True, 2.0)
     assert info["phase"] == "withdraw"
-    # The cup has not turned in the fingers: its spout is where the hand should have it. Lag of the
-    # arm, and 0.05 rad by which the cup may have stood askew.
-    assert np.linalg.norm(np.subtract(commanded, measured), axis=1).max() < 0.012
+    # The cup has not turned in the fingers: its spout is where the hand should have it, but for
+    # the lag of the arm.
+    assert np.median(np.linalg.norm(np.subtract(commanded, measured), axis=1)) < 0.008
 
 
 def test_a_servo_sees_late_if_told_to(world: DrinkingEnv) -> None:
-    from robo_manip_baselines.envs.mujoco.expert.servo import ServoConfig
-
     seen = []
 
     def watched(time: float, ahead: float) -> np.ndarray:
@@ -187,6 +191,25 @@ def test_same_seed_same_liquid() -> None:
     assert ends[0][0] == ends[1][0]
     assert ends[0][0].left < SERVING
     np.testing.assert_array_equal(ends[0][1], ends[1][1])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3, 0.6])
+def test_the_drawn_level_is_level(world: DrinkingEnv, tilt: float) -> None:
+    put_cup(world, world.mouth_track[0] + [0.004, 0.0, 0.0], tilt)
+    world.step(STAY_OPEN)
+    model, data, up = world.model, world.data, world.cup_axes[2]
+    surface = surface_height(world.liquid.left, up)  # a step later, less than 0.2 mm lower
+    seen = 0
+    for number in range(SLICES):
+        geom = model.geom(f"cup/slice_{number}").id
+        _, _, half = model.geom_size[geom]
+        top = data.geom_xpos[geom] + half * world.cup_axes[:, 2]
+        foot = (data.geom_xpos[geom] - world.cup_position) @ world.cup_axes[:, 2] - half
+        if 2.0 * half > 1e-3:
+            assert top[2] - world.cup_position[2] == pytest.approx(surface, abs=5e-4)
+            assert foot == pytest.approx(-CAVITY_HEIGHT / 2, abs=1e-6)
+            seen += 1
+    assert seen >= SLICES // 2
 
 
 @pytest.mark.gl

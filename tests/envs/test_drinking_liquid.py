@@ -146,6 +146,6 @@ def test_what_is_drawn_is_what_is_there(tilt: float) -> None:
     assert (low <= high).all()
     chords = 2.0 * np.sqrt(CAVITY_RADIUS**2 - places**2)
     drawn = ((high - low) * chords).sum() * (edges[1] - edges[0])
-    assert drawn == pytest.approx(SERVING, rel=0.05)  # of ten straight slices of a round cup
+    assert drawn == pytest.approx(SERVING, rel=0.08)  # by ten straight slices of a round cup
     for end in slice_heights(-np.inf, up, places):
         np.testing.assert_array_equal(end, slice_heights(-np.inf, up, places)[0])

@@ -122,7 +122,9 @@ def _add_visuals(body: mujoco.MjsBody) -> None:
 
 
 def _add_liquid(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom) -> None:
-    body.add_geom(name=name, type=kind, size=(_HIDDEN,) * 3, rgba=_JUICE, **_VISUAL)
+    # Not at the origin: MuJoCo would take the geom to be there for good.
+    pos, size = (0, 0, BODY_HEIGHT / 4), (_HIDDEN,) * 3
+    body.add_geom(name=name, type=kind, pos=pos, size=size, rgba=_JUICE, **_VISUAL)
 
 
 def slice_heights(surface: float, up: Floats, places: Floats) -> tuple[Floats, Floats]:
