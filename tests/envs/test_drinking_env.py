@@ -148,7 +148,7 @@ def test_the_hand_and_the_spout_of_a_held_cup(tilt: float) -> None:
 def test_a_tilted_cup_reaches_a_mouth_that_is_8_cm_off_on_every_axis(
     corner: tuple[float, float, float],
 ) -> None:
-    """At 0.70 rad, where a cup keeps 2 % of a serving; the offset is up to 5 cm, and 3 cm are of the motion."""
+    """At 0.70 rad, where it keeps 2 % of a serving; offset up to 5 cm, and 3 cm of motion."""
     kinematics, joints = ArmKinematics("right"), np.array(HOME_QPOS)
     mouth = MOUTH_BASE + (FACE_OFFSET + 0.03) * np.array(corner)
     start = np.array([*(MOUTH_BASE + STANDOFF), 0.0])
