@@ -127,6 +127,7 @@ def write_aggregation(
         if trained := [condition for condition in plan.conditions if condition.checkpoint]:
             facts["Trained already"] = ", ".join(f"{c.name}: {c.checkpoint}" for c in trained)
         facts["People"] = str(plan.people)
+        facts["Face"] = plan.face
         title, caution = f"Benchmark {plan.env}", preset.caution
         report = make_report(statistics, title, videos=clips, facts=facts, caution=caution)
         written = write_tables(out / TABLES, report.tables)
@@ -140,7 +141,7 @@ def write_aggregation(
 
 
 def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
-    """Lay out the table that the command prints at its end: both rates, and the peak force.
+    """Lay out the table that the command prints at its end: the rates, and the peak force.
 
     The interval is that of the end point; of the task's columns in tables, the first one is shown.
     """
@@ -154,6 +155,8 @@ def closing_summary(statistics: BenchmarkStatistics, out: Path) -> str:
             f"{statistics.end_point} {statistics.rate(c)}",
             f"{other} {rate or 0.0:.1%}",
         ]
+        if c.safe:
+            parts.append(f"safe success {c.safe.rate or 0.0:.1%}")
         for column in columns:
             if (mean := mean_and_p90(c, column)[0]) is not None:
                 parts.append(f"mean {column.name.replace('_', ' ')} {mean:.1f} {column.unit}")

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 from annotated_types import Len
 
 from robo_manip_baselines.benchmark.statistics.outcomes import END_POINTS
+from robo_manip_baselines.envs.mujoco.face import FACES
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
@@ -244,9 +245,10 @@ class ConditionsDocument:
         presets: name of a preset -> names of its conditions, or ``published``.
         headline: end point of the benchmark, a key of `END_POINTS`.
         people: in demonstrations and evaluation.
+        face: kind of face, one of `FACES`.
 
     Raises:
-        RequestError: there is no such end point.
+        RequestError: there is no such end point or face.
     """
 
     conditions: Annotated[tuple[Any, ...], Len(1, 1000)]
@@ -254,9 +256,11 @@ class ConditionsDocument:
     presets: dict[str, Any] = field(default_factory=dict)
     headline: str = "success"
     people: DrawnPeople = EVERYBODY
+    face: str = FACES[0]
 
     def __post_init__(self) -> None:
         require_choice("headline", self.headline, END_POINTS)
+        require_choice("face", self.face, FACES)
 
 
 @dataclass(frozen=True)
@@ -269,6 +273,7 @@ class ConditionFile:
         presets: name of a preset -> names of its conditions; others have all of them.
         headline: end point of the benchmark, a key of `END_POINTS`.
         people: in demonstrations and evaluation.
+        face: kind of face.
     """
 
     env: str
@@ -276,6 +281,7 @@ class ConditionFile:
     presets: Mapping[str, tuple[str, ...]]
     headline: str = "success"
     people: DrawnPeople = EVERYBODY
+    face: str = FACES[0]
 
     def choose(self, names: Sequence[str]) -> tuple[ConditionConfig, ...]:
         """Return the conditions of these names, in the order of the file.
@@ -333,6 +339,7 @@ def read_conditions(path: Path) -> ConditionFile:
             },
             document.headline,
             document.people,
+            document.face,
         )
         for names in file.presets.values():
             file.choose(names)

@@ -16,6 +16,7 @@ from robo_manip_baselines.benchmark.conditions import (
 )
 from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, WorkItem
 from robo_manip_baselines.benchmark.worker import LIBRARY, STATS
+from robo_manip_baselines.envs.mujoco.face import FACES
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
@@ -161,6 +162,7 @@ class Plan:
         library, error_stats: files of the user; None for those that ship with the package.
         headline: end point that was declared for it, see `ConditionFile`.
         people: in demonstrations and evaluation.
+        face: kind of face, likewise.
     """
 
     env: str
@@ -170,6 +172,7 @@ class Plan:
     error_stats: Path | None = None
     headline: str = "success"
     people: DrawnPeople = EVERYBODY
+    face: str = FACES[0]
 
     @cached_property
     def runs(self) -> tuple[PlannedRun, ...]:
@@ -227,6 +230,9 @@ class Plan:
         if (people := self.people.demonstrations) != "all":
             variant += f"_{people}"
             env_kwargs["people"] = people
+        if self.face != FACES[0]:
+            variant += f"_{self.face}"
+            env_kwargs["face"] = self.face
         items = []
         for seeds in _blocks(0, self.preset.demonstrations, self.preset.demonstration_block):
             config = Collection(self.env, Path(OUT), condition.expert, seeds, env_kwargs)
@@ -295,6 +301,8 @@ class Plan:
         files: Mapping[str, Path],
     ) -> WorkItem:
         env_kwargs = {"people": self.people.evaluation} if self.people else {}
+        if self.face != FACES[0]:
+            env_kwargs["face"] = self.face
         if condition.checkpoint:  # whose demonstrations are not the benchmark's
             env_kwargs["motion"] = condition.motion
             if self.library:
@@ -346,6 +354,7 @@ def make_plan(
     error_stats: Path | None = None,
     headline: str = "success",
     people: DrawnPeople = EVERYBODY,
+    face: str = FACES[0],
 ) -> Plan:
     """Plan a benchmark.
 
@@ -357,6 +366,7 @@ def make_plan(
         error_stats: of drawn errors; those that ship with the package if None.
         headline: end point of the benchmark.
         people: in demonstrations and evaluation.
+        face: kind of face, likewise.
 
     Raises:
         RequestError: a file cannot be used, a condition needs predictions that the library lacks or
@@ -386,6 +396,7 @@ def make_plan(
         error_stats and error_stats.resolve(),
         headline,
         people,
+        face,
     )
 
 

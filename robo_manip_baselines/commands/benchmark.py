@@ -42,6 +42,7 @@ from robo_manip_baselines.benchmark.scheduler import (
 from robo_manip_baselines.benchmark.work_item import ITEMS, ArtifactStore, WorkItem
 from robo_manip_baselines.commands import foresight
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.face import FACES
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.runs.command import EXIT_FAILED, parse
 from robo_manip_baselines.runs.documents import parse_settings
@@ -82,6 +83,7 @@ class BenchmarkOptions:
         train_settings: Settings of trainings that differ from the preset's, as NAME=VALUE
             (steps=200); docs/training.md lists them.
         device: Device of the networks: cpu or cuda; as in the preset if not given.
+        face: Kind of face: visual or physical; as in the file of conditions if not given.
         motion_library: File of recorded face motion; the one that ships with the package if not
             given.
         error_stats: File of error statistics; the one that ships with the package if not given.
@@ -110,6 +112,7 @@ class BenchmarkOptions:
     demonstrations: Episodes | None = None
     train_settings: tuple[str, ...] = ()
     device: str | None = None
+    face: str | None = None
     motion_library: Path | None = None
     error_stats: Path | None = None
     reference: str | None = None
@@ -131,6 +134,8 @@ class BenchmarkOptions:
         require_choice("executor", self.executor, EXECUTORS)
         if self.device is not None:
             require_choice("device", self.device, ("cpu", "cuda"))
+        if self.face is not None:
+            require_choice("face", self.face, FACES)
         require_ranges(self)
         if self.executor == "ray" and self.num_workers is not None:
             raise RequestError("--num_workers goes with --executor local; Ray counts its own cores")
@@ -267,6 +272,7 @@ def plan_of(options: BenchmarkOptions) -> Plan:
         error_stats=options.error_stats,
         headline=file.headline,
         people=file.people,
+        face=options.face or file.face,
     )
 
 
@@ -316,6 +322,7 @@ def overview(plan: Plan, items: Sequence[WorkItem], store: ArtifactStore, worker
         "conditions": ", ".join(condition.name for condition in plan.conditions),
         "end point": plan.headline,
         "people": str(plan.people),
+        "face": plan.face,
         **{kind: f"{left[kind]} of {count} items to do" for kind, count in total.items()},
         "done": f"{duration(seconds)} of work, videos apart",
         "workers": str(workers),

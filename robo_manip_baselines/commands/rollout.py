@@ -15,7 +15,7 @@ from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
-from robo_manip_baselines.policy.presets import Chunk
+from robo_manip_baselines.policy.presets import Chunk, Delay
 from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import require_out_file
@@ -76,6 +76,10 @@ class PolicyOptions:
         temporal_ensemble: Average the predictions of all chunks, whatever the checkpoint says.
         n_action_steps: Execute so many actions of a chunk before the next, whatever the checkpoint
             says.
+        strategy: Execution of chunks: synchronous, naive, ensemble, rtc, rtc_trained or
+            roll_forward; that of the checkpoint if not given.
+        inference_delay: Control steps between an observation and the first action that is made
+            from it.
         device: Device of the network: auto, cpu, cuda or cuda:1.
         precision: fp32, or bf16 for the products inside the network.
         video: Videos to write: of the first successes and the first failures, half of each.
@@ -87,6 +91,8 @@ class PolicyOptions:
     num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
     temporal_ensemble: bool = False
     n_action_steps: Annotated[Chunk | None, tyro.conf.arg(aliases=["--execute"])] = None
+    strategy: str | None = None
+    inference_delay: Delay = 0
     device: str = "auto"
     precision: str = "fp32"
     video: NonNegativeInt = 0
@@ -104,6 +110,8 @@ class RolloutOptions:
         num_episodes: Episodes, one for each seed from --seed on.
         seed: Seed of the first episode; if not given, 0 with --scripted and 1000 with --policy.
         out: Folder to write to; if not given, dataset/<env> or results/<env>_<run>.
+        face: Kind of face: visual, or physical, soft tissue on a head that yields. If not given,
+            visual, or as in the demonstrations of the policy.
         face_motion: Start of the face's motion: with the episode, or after_lift. If not given,
             episode, or as in the demonstrations of the policy.
         motion: Motion of the face: recorded, sway, ..., with parameters sway:amplitude=0.03, or a
@@ -127,6 +135,7 @@ class RolloutOptions:
     num_episodes: Episodes = 50
     seed: Seed | None = None
     out: Path | None = None
+    face: str | None = None
     face_motion: str | None = None
     motion: str | None = None
     people: str | None = None
@@ -146,16 +155,18 @@ class RolloutOptions:
         return range(start, start + self.num_episodes)
 
     @property
-    def motion_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about the motion that were given.
+    def face_arguments(self) -> dict[str, Any]:
+        """Arguments of the environment about the face and its motion that were given.
 
         Raises:
-            RequestError: there are no such motion or people.
+            RequestError: there are no such face, motion or people.
         """
+        from robo_manip_baselines.envs.mujoco.face import FACES
         from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
         from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 
         given = {
+            "face": self.face and require_choice("face", self.face, FACES),
             "face_motion": self.face_motion,
             "motion": None if self.motion is None else str(parse_motion(self.motion)),
             "people": self.people and require_choice("people", self.people, PEOPLE),
@@ -214,14 +225,14 @@ def to_collection(options: RolloutOptions) -> Collection:
 
     spec, demonstration = options.spec, options.demonstration
     env_kwargs: dict[str, Any] = {"cameras": spec.cameras, "image_size": spec.image_size}
-    if spec.arms != UNTRAINED.arms:
+    if spec.arms != task_entry(options.env).arms[0]:
         env_kwargs["arms"] = spec.arms
     return Collection(
         env=options.env,
         out=options.out or Path("dataset") / options.env,
         expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
         seeds=options.seeds(first=0),
-        env_kwargs={**env_kwargs, "face_motion": "episode", **options.motion_arguments},
+        env_kwargs={**env_kwargs, "face_motion": "episode", **options.face_arguments},
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
@@ -307,10 +318,12 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         checkpoint=given.checkpoint,
         seeds=options.seeds(FIRST_SEED),
         out=options.out,
-        env_kwargs=options.motion_arguments,
+        env_kwargs=options.face_arguments,
         corruption=None if corruption == trained.corruption else corruption,
         temporal_ensemble=given.temporal_ensemble,
         n_action_steps=given.n_action_steps,
+        strategy=given.strategy,
+        inference_delay=given.inference_delay,
         num_envs=given.num_envs,
         workers=options.workers,
         device=given.device,
@@ -351,6 +364,9 @@ def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | Non
     default = RolloutOptions(tyro.MISSING, spec=spec)
     options = parse(RolloutOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)
     require_consistent(options)
+    if options.scripted and not last_value(args, "arms"):
+        arms = task_entry(options.env).arms[0]
+        options = replace(options, spec=replace(options.spec, arms=arms))
     return options, checkpoint
 
 

@@ -25,7 +25,17 @@ def make_arrays(
     """
     schema = EpisodeSchema.of(task_entry("FeedingEnv"))
     rng = np.random.default_rng(seed)
-    sizes = {"T": steps, "A": 7 * arms, "J": 6 * arms, "G": arms, "Q": 23, "V": 22, "H": 5}
+    sizes = {
+        "T": steps,
+        "A": 7 * arms,
+        "J": 6 * arms,
+        "G": arms,
+        "Q": 23,
+        "V": 22,
+        "H": 5,
+        "R": 11,
+        "B": 4,
+    }
     sizes["K"] = MAX_HORIZON + 1 if version > 2 else OLD_FRAMES
     arrays: dict[str, np.ndarray] = {}
     # By version, so that the numbers of the older fields are those of an older file.
@@ -43,7 +53,9 @@ def make_arrays(
         if field.dtype == "bool":
             values = values > 0
         arrays[field.name] = values.astype(field.dtype)
-    return {name: arrays[name] for name in schema.fields_of(version)}
+    optional = [field.name for field in schema.fields if field.is_optional]
+    present = optional if version > 3 else ()
+    return {name: arrays[name] for name in schema.fields_of(version, present)}
 
 
 def make_frames(steps: int = 12, seed: int = 0, size: tuple[int, int] = (24, 32)) -> np.ndarray:

@@ -8,7 +8,7 @@ of its own with the same signature.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -111,6 +111,12 @@ def min_max(state: Vector, action: Vector) -> Normalization:
     return Normalization(*measure(state), *measure(action))
 
 
+def action_min_max(state: Vector, action: Vector) -> Normalization:
+    """Normalise (n, A) actions to the range [-1, 1], and (n, S) states as `mean_std` does."""
+    states, actions = mean_std(state, action), min_max(state, action)
+    return replace(states, action_mean=actions.action_mean, action_std=actions.action_std)
+
+
 def no_normalization(state: Vector, action: Vector) -> Normalization:
     """Leave (n, S) states and (n, A) actions in their own units."""
     s, a = state.shape[1], action.shape[1]
@@ -121,5 +127,6 @@ def no_normalization(state: Vector, action: Vector) -> Normalization:
 METHODS: dict[str, Callable[[Vector, Vector], Normalization]] = {
     "mean_std": mean_std,
     "min_max": min_max,
+    "action_min_max": action_min_max,
     "none": no_normalization,
 }

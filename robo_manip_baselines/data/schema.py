@@ -1,7 +1,8 @@
 """Schema of episode files: the one table that writer, reader, verifier and docs are made from.
 
 Shape symbols: T control steps, A actions, J arm joints, G grippers, Q positions and V velocities
-of the simulator's state, K frames of the truth from now on, H frames of a forecast. One arm has
+of the simulator's state, K frames of the truth from now on, H frames of a forecast, R regions of
+the face, B bodies that touch it. One arm has
 A=7, J=6, G=1; two arms have A=14, J=12, G=2, left before right.
 """
 
@@ -33,11 +34,11 @@ from robo_manip_baselines.runs.images import CODECS, MAX_SIDE
 from robo_manip_baselines.runs.npz import add_array
 
 SCHEMA = "robo_manip_baselines/episode"
-SCHEMA_VERSION = 3
-READABLE_VERSIONS = (1, 2, 3)
+SCHEMA_VERSION = 4
+READABLE_VERSIONS = (1, 2, 3, 4)
 """A file has the lowest version that describes it: 2 added ``predicted_mouth``, 3 the truth more
 than 5 frames ahead, and other tasks than feeding, whose fields and attributes are those of the task
-that ``env_id`` names."""
+that ``env_id`` names, 4 forces on the face, ``region_force`` and ``region_impulse``."""
 
 OLD_FRAMES = 6
 """K of files of versions 1 and 2: the truth now and 1 ... 5 frames ahead."""
@@ -66,15 +67,19 @@ SYMBOLS: Mapping[str, str] = {
     "V": "simulator velocities (`model.nv`)",
     "K": "frames of the truth, from now on: 25; in files of versions 1 and 2, 6",
     "H": "frames of the forecast: 1 to 24, as many as the motion library holds; the shipped one, 5",
+    "R": "regions of the face: forehead, eyes, nose, cheeks, lips, chin, tongue, teeth, mouth (its "
+    "other walls inside), head (sides and back), neck (with the bust)",
+    "B": "what touches it: gripper, arm, anything else, then the objects of the task in order",
 }
 ALLOWED_SIZES: Mapping[str, tuple[int, ...]] = {
     "A": (7, 14),
     "J": (6, 12),
     "G": (1, 2),
     "K": (OLD_FRAMES, MAX_HORIZON + 1),
+    "R": (11,),
 }
 
-MAX_SIZES: Mapping[str, int] = {"T": 180_000, "Q": 1000, "V": 1000, "H": MAX_HORIZON}
+MAX_SIZES: Mapping[str, int] = {"T": 180_000, "Q": 1000, "V": 1000, "H": MAX_HORIZON, "B": 100}
 """Largest sizes: an hour at 50 steps a second. Checked before memory is taken."""
 
 MAX_BYTES = 2**30
@@ -448,11 +453,12 @@ def value_problems(field: Field, values: np.ndarray, num_phases: int | None) -> 
     name, rule = field.name, field.rule
 
     def first(bad: ArrayLike, what: str) -> list[str]:
-        return [f"'{name}' {what} at step {row}" for row in np.flatnonzero(bad)[:1]]
+        rows = np.asarray(bad).reshape(len(values), -1).any(axis=1)
+        return [f"'{name}' {what} at step {row}" for row in np.flatnonzero(rows)[:1]]
 
     finite = np.isfinite(values)
     if not finite.all():
-        return first(~finite.reshape(len(values), -1).all(axis=1), "is NaN or infinite, first")
+        return first(~finite, "is NaN or infinite, first")
     if rule == "increasing":
         return first(np.diff(values, prepend=-np.inf) <= 0, "does not increase")
     if rule == "unit quaternion":

@@ -54,12 +54,19 @@ class PolicyModel(nn.Module):
         n_obs_steps: O, steps of the window, the present one included.
         noise_size: Z, elements of noise that `loss` needs for each example.
         sample_noise_size: Z, elements of noise that `predict` needs for each example.
+        action_range: largest absolute normalised action that `predict` returns; None for no limit.
+        strategies: of ``rtc``, which needs `inpaint`, and ``rtc_trained``, which needs `extend`,
+            those with which the network can act.
+        max_delay: largest delay that training with fixed actions has prepared the network for.
     """
 
     chunk_size: int
     n_obs_steps: int = 1
     noise_size: int = 0
     sample_noise_size: int = 0
+    action_range: float | None = None
+    strategies: tuple[str, ...] = ()
+    max_delay: int = 0
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return ``loss``, the scalar to minimise, and its parts by name, all float32 scalars."""
@@ -75,6 +82,33 @@ class PolicyModel(nn.Module):
                 a function of the episode's seed and of the control step, so that sampled actions
                 do not depend on the number of environments.
         """
+        raise NotImplementedError
+
+    def inpaint(
+        self,
+        state: Tensor,
+        images: Tensor | None,
+        noise: Tensor | None,
+        action: Tensor,
+        weight: Tensor,
+    ) -> Tensor:
+        """Return a chunk (B, K, A) as `predict` does, drawn towards the one under way.
+
+        ``action`` (B, K, A) float32, normalised, is what the chunk under way has for these steps;
+        ``weight`` (B, K) float32 is 1 where that is executed in any case, 0 where the new chunk is
+        free, and in between.
+        """
+        raise NotImplementedError
+
+    def extend(
+        self,
+        state: Tensor,
+        images: Tensor | None,
+        noise: Tensor | None,
+        action: Tensor,
+        weight: Tensor,
+    ) -> Tensor:
+        """Return a chunk (B, K, A) that has the actions of weight 1, other than in `inpaint`."""
         raise NotImplementedError
 
     def for_inference(self, dtype: torch.dtype) -> PolicyModel:

@@ -21,6 +21,9 @@ SAMPLERS = ("episode", "frame")
 PRECISIONS = ("auto", "fp32", "bf16")
 SCHEDULES = ("constant", "cosine")
 
+STRATEGIES = ("synchronous", "naive", "ensemble", "rtc", "rtc_trained", "roll_forward")
+"""Names of the ways to execute chunks; all but ``ensemble`` execute one chunk at a time."""
+
 MAX_VECTOR = 4096
 """Most elements of a state or an action."""
 
@@ -30,6 +33,7 @@ MAX_CHUNK = 10_000
 """Most actions that are predicted at once."""
 
 Chunk = Annotated[int, Interval(ge=1, le=MAX_CHUNK)]
+Delay = Annotated[int, Interval(ge=0, le=MAX_CHUNK)]
 Width = Annotated[int, Interval(ge=1, le=65536)]
 Layers = Annotated[int, Interval(ge=1, le=256)]
 
@@ -79,6 +83,9 @@ class TrainSettings:
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
+        norm: normalisation of states and actions, ``mean_std``, ``min_max`` (to [-1, 1]),
+            ``action_min_max`` (that of actions, the other of states) or ``none``; the policy's own
+            if not given.
         precision: ``fp32``, ``bf16`` (autocast; losses and norms stay fp32), or ``auto``.
         compile: whether to use ``torch.compile``.
         cuda_graph: whether a single process on a CUDA device records its step once and replays it,
@@ -101,6 +108,7 @@ class TrainSettings:
     clock_noise: Amount = 0.0
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
+    norm: str | None = None
     precision: str = "auto"
     compile: bool = False
     cuda_graph: bool = True
@@ -118,12 +126,18 @@ class TrainSettings:
 class ActionExecution:
     """Execution of predicted action chunks.
 
+    With a delay, a chunk can be executed so many control steps after the observation that it was
+    made from. What happens meanwhile is the strategy; ``docs/policies.md`` describes them.
+
     Attributes:
         temporal_ensemble: predict a chunk at every step and average all predictions for that step;
             otherwise execute the beginning of a chunk before the next is predicted.
         ensemble_decay: k in the weights exp(-k i) of the ensemble, i = 0 for the oldest prediction
             (public ACT: 0.01).
         n_action_steps: actions of a chunk that are executed, without the ensemble.
+        strategy: without the ensemble, any other of ``STRATEGIES``.
+        inference_delay: control steps between an observation and the first action that is made
+            from it.
 
     Raises:
         RequestError: a value that is not valid.
@@ -132,17 +146,31 @@ class ActionExecution:
     temporal_ensemble: bool = True
     ensemble_decay: Annotated[float, Interval(ge=-100.0, le=100.0)] = 0.01
     n_action_steps: Chunk = 1
+    strategy: str = "synchronous"
+    inference_delay: Delay = 0
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        require_choice("strategy", self.strategy, [s for s in STRATEGIES if s != "ensemble"])
+
+    @property
+    def name(self) -> str:
+        """Strategy, which is ``ensemble`` with the temporal ensemble."""
+        return "ensemble" if self.temporal_ensemble else self.strategy
 
     def to_json(self) -> dict[str, Any]:
-        """Return all settings under the names that checkpoints have had since the first release."""
-        return {
+        """Return all settings under the names that checkpoints have had since the first release.
+
+        Strategy and delay, which are younger, are left out where they make no difference.
+        """
+        values = {
             "temporal_ensemble": self.temporal_ensemble,
             "decay": self.ensemble_decay,
             "execute": self.n_action_steps,
         }
+        if self.name not in ("ensemble", "synchronous"):
+            values["strategy"] = self.strategy
+        return values | ({"delay": self.inference_delay} if self.inference_delay else {})
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> ActionExecution:
@@ -151,7 +179,11 @@ class ActionExecution:
         Raises:
             RequestError: a name or a value is not valid.
         """
-        names = {"decay": "ensemble_decay", "execute": "n_action_steps"}
+        names = {
+            "decay": "ensemble_decay",
+            "execute": "n_action_steps",
+            "delay": "inference_delay",
+        }
         return convert({names.get(k, k): v for k, v in values.items()}, cls, "acting")
 
 

@@ -33,8 +33,9 @@ class PolicyEntry:
         model: ``module:class`` of its ``PolicyModel``, built as ``Model(config, dims)``.
         presets: ``module:name`` of a dict: preset -> ``PolicyPreset``, the first of which is the
             default where none fits the machine.
-        normalization: of its states and actions: ``mean_std``, ``min_max`` (to [-1, 1]), ``none``,
-            or ``module:function`` of its own; see `data.normalization`.
+        normalization: of its states and actions: ``mean_std``, ``min_max`` (to [-1, 1]),
+            ``action_min_max`` (that of actions alone), ``none``, or ``module:function`` of its own;
+            see `data.normalization`. Training's option ``norm`` goes before it.
     """
 
     config: str
@@ -53,6 +54,18 @@ POLICIES: dict[str, PolicyEntry] = {
         "robo_manip_baselines.policy.mlp.config:MlpConfig",
         "robo_manip_baselines.policy.mlp.model:MlpModel",
         "robo_manip_baselines.policy.mlp.config:PRESETS",
+    ),
+    "Diffusion": PolicyEntry(
+        "robo_manip_baselines.policy.diffusion.config:DiffusionConfig",
+        "robo_manip_baselines.policy.diffusion.model:DiffusionModel",
+        "robo_manip_baselines.policy.diffusion.config:PRESETS",
+        normalization="action_min_max",
+    ),
+    "Flow": PolicyEntry(
+        "robo_manip_baselines.policy.flow.config:FlowConfig",
+        "robo_manip_baselines.policy.flow.model:FlowModel",
+        "robo_manip_baselines.policy.flow.config:PRESETS",
+        normalization="action_min_max",
     ),
 }
 

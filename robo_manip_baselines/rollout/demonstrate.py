@@ -109,6 +109,8 @@ def demonstrate(
         for key, camera in cameras.items():
             images[camera].append(encode_image(observation[key], codec, quality))
         observation, _, terminated, truncated, info = env.step(action)
+        for name, value in world.contact_row().items():
+            rows[name].append(value)
         rows["is_success"].append(info["is_success"])
         rows["is_success_strict"].append(info["is_success_strict"])
         ended = terminated or truncated

@@ -29,7 +29,7 @@ from robo_manip_baselines.policy.checkpoint import (
     read_checkpoint,
     without_initial_weights,
 )
-from robo_manip_baselines.policy.presets import ActionExecution, Chunk
+from robo_manip_baselines.policy.presets import STRATEGIES, ActionExecution, Chunk, Delay
 from robo_manip_baselines.rollout.agreement import require_continuation
 from robo_manip_baselines.rollout.results import (
     SUMMARY,
@@ -81,6 +81,9 @@ class EvaluationConfig:
         temporal_ensemble: average the predictions of all chunks, whatever the checkpoint says.
         n_action_steps: actions of a chunk to execute before the next one, where it is not the
             number of the checkpoint; None otherwise.
+        strategy: one of ``STRATEGIES`` to execute chunks with; that of the checkpoint if None.
+        inference_delay: control steps between an observation and the first action that is made
+            from it.
         num_envs: episodes that run at once; results do not depend on it.
         workers: processes in which environments step; 0 steps them in this one.
         device: of the network: auto, cpu, cuda or cuda:NUMBER.
@@ -98,6 +101,8 @@ class EvaluationConfig:
     corruption: Corruption | None = None
     temporal_ensemble: bool = False
     n_action_steps: Chunk | None = None
+    strategy: str | None = None
+    inference_delay: Delay = 0
     num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
     workers: Processes = 2
     device: str = "auto"
@@ -108,8 +113,16 @@ class EvaluationConfig:
         object.__setattr__(self, "env_kwargs", as_json(self.env_kwargs))
         require_seeds(self.seeds)
         require_ranges(self)
+        if self.strategy is not None:
+            require_choice("strategy", self.strategy, STRATEGIES)
         if self.temporal_ensemble and self.n_action_steps is not None:
             raise RequestError("--temporal_ensemble and --n_action_steps: give one of them")
+        if self.strategy == "ensemble" and self.n_action_steps is not None:
+            raise RequestError("--strategy ensemble and --n_action_steps: give one of them")
+        if self.temporal_ensemble and self.strategy not in (None, "ensemble"):
+            raise RequestError(
+                f"--temporal_ensemble and --strategy {self.strategy}: give one of them"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Return what JSON can hold."""
@@ -143,6 +156,7 @@ class EvaluationPlan:
         config: the configuration.
         checkpoint: of the policy.
         env: environment in which the policy acts.
+        xml_hash: of the environment's model.
         execution: of the policy's chunks of actions.
         device: of the network.
     """
@@ -150,6 +164,7 @@ class EvaluationPlan:
     config: EvaluationConfig
     checkpoint: Checkpoint
     env: EnvConfig
+    xml_hash: str
     execution: ActionExecution
     device: torch.device
 
@@ -179,20 +194,20 @@ class EvaluationPlan:
             recorded = {k: v for k, v in recorded.items() if k != "clips"} | {"people": "test"}
         env_kwargs = pin_library({**recorded, **config.env_kwargs})
         env = EnvConfig(checkpoint.env, spec, env_kwargs)
-        _require_fit(checkpoint, env)
+        xml_hash = _require_fit(checkpoint, env)
         if (spec.cameras or config.videos) and (problem := opengl_problem()):
             why = "the policy sees images" if spec.cameras else "--video 0 needs no OpenGL"
             raise RequestError(f"{problem} ({why})")
-        execution = choose_execution(
-            checkpoint.execution, config.temporal_ensemble, config.n_action_steps
-        )
-        return cls(config, checkpoint, env, execution, choose_device(config.device))
+        execution = choose_execution(checkpoint.execution, config)
+        return cls(config, checkpoint, env, xml_hash, execution, choose_device(config.device))
 
     def __str__(self) -> str:
         execution, checkpoint, seeds = self.execution, self.checkpoint, self.config.seeds
         how = f"{execution.n_action_steps} actions of each chunk"
         if execution.temporal_ensemble:
             how = f"temporal ensemble (decay {execution.ensemble_decay:g})"
+        if execution.inference_delay or execution.name not in ("ensemble", "synchronous"):
+            how += f", {execution.name} with a delay of {execution.inference_delay} steps"
         return (
             f"{checkpoint.policy}, {self.condition}, step {checkpoint.step}, on "
             f"{self.device} in {self.config.precision}: {how}; seeds {seeds[0]} to {seeds[-1]}"
@@ -226,7 +241,7 @@ class EvaluationPlan:
             "env": self.env.task.env_id,
             "env_kwargs": without_library_path(self.env.env_kwargs),
             "observation": self.env.spec.to_json(),
-            "xml_hash": self.checkpoint.xml_hash,
+            "xml_hash": self.xml_hash,
             "policy": self.checkpoint.policy,
             "checkpoint": self.checkpoint.content_hash,
             "acting": acting,
@@ -245,7 +260,7 @@ class EvaluationPlan:
         shows_prediction = spec.corruption.error == "model"
         training = {
             "network": asdict(without_initial_weights(checkpoint.config)),
-            "settings": asdict(checkpoint.settings),
+            "settings": _set(asdict(checkpoint.settings)),
             "step": checkpoint.step,
             "demonstrations": checkpoint.dataset.get("content_hash"),
         }
@@ -253,7 +268,7 @@ class EvaluationPlan:
             "env_kwargs": kwargs,
             "motion_sha256": library.motion_sha256,
             "prediction_sha256": library.prediction_sha256 if shows_prediction else None,
-            "xml_hash": checkpoint.xml_hash,
+            "xml_hash": self.xml_hash,
             "execution": self.settings["acting"],
             "precision": self.config.precision,
             "device": self.device.type,
@@ -414,13 +429,25 @@ def _evaluate(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
     return summary, list(videos)
 
 
-def choose_execution(
-    trained: ActionExecution, temporal_ensemble: bool, n_action_steps: int | None
-) -> ActionExecution:
-    """Return the action execution of a checkpoint with the given changes."""
-    if n_action_steps is not None:
-        return replace(trained, temporal_ensemble=False, n_action_steps=n_action_steps)
-    return replace(trained, temporal_ensemble=True) if temporal_ensemble else trained
+def _set(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return training settings as they were before ``norm``, which older checkpoints lack."""
+    return {name: value for name, value in settings.items() if (name, value) != ("norm", None)}
+
+
+def choose_execution(trained: ActionExecution, config: EvaluationConfig) -> ActionExecution:
+    """Return the action execution of a checkpoint with the changes that an evaluation asks for.
+
+    Raises:
+        RequestError: they do not go together.
+    """
+    changes: dict[str, Any] = {"inference_delay": config.inference_delay}
+    if config.n_action_steps is not None:
+        changes |= {"temporal_ensemble": False, "n_action_steps": config.n_action_steps}
+    if config.temporal_ensemble or config.strategy == "ensemble":
+        changes |= {"temporal_ensemble": True}
+    elif config.strategy is not None:
+        changes |= {"temporal_ensemble": False, "strategy": config.strategy}
+    return replace(trained, **changes)
 
 
 def run_name(checkpoint: Path) -> str:
@@ -433,24 +460,41 @@ def run_name(checkpoint: Path) -> str:
     return path.name
 
 
-def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> None:
-    """Make sure that the environment is the one that the policy was trained for.
+def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> str:
+    """Return the hash of the environment's model, which is the one that the policy was trained for.
+
+    A policy may be evaluated with another kind of face than it was trained with: the environment
+    with its own face counts then.
 
     Raises:
         RequestError: naming what the checkpoint has and what the environment has.
     """
-    with contextlib.closing(config.make()) as env:
-        world = world_of(env)
-        pairs = {
-            "actions": (", ".join(checkpoint.action_names), ", ".join(world.action_names)),
-            "control period": (checkpoint.control_period, CONTROL_PERIOD),
-            "size of the state": (checkpoint.dims.state, config.vector_size),
-            "model hash": (checkpoint.xml_hash[:12], world.xml_hash[:12]),
-        }
-    for name, (trained, here) in pairs.items():
-        if trained != here:
+    face = checkpoint.dataset.get("env_kwargs", {}).get("face", "visual")
+    own = here = _facts_of_model(config)
+    if here["face"] != face:
+        own = _facts_of_model(config, face=face)
+    pairs = {
+        "actions": (", ".join(checkpoint.action_names), own["actions"]),
+        "control period": (checkpoint.control_period, CONTROL_PERIOD),
+        "size of the state": (checkpoint.dims.state, config.vector_size),
+        "model hash": (checkpoint.xml_hash[:12], own["xml_hash"][:12]),
+    }
+    for name, (trained, found) in pairs.items():
+        if trained != found:
             raise RequestError(
                 f"checkpoint '{checkpoint.folder}' was trained with {name} {trained}; {config.env} "
-                f"has {here} here; install the release that trained it, "
+                f"has {found} here; install the release that trained it, "
                 f"{checkpoint.versions.get('robo_manip_baselines', 'unknown')}, or train again"
             )
+    return here["xml_hash"]
+
+
+def _facts_of_model(config: EnvConfig, **changes: Any) -> dict[str, str]:
+    """Return kind of face, actions and hash of an environment's model."""
+    with contextlib.closing(config.make(**changes)) as env:
+        world = world_of(env)
+        return {
+            "face": world.face_kind,
+            "actions": ", ".join(world.action_names),
+            "xml_hash": world.xml_hash,
+        }

@@ -21,6 +21,12 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry, task_entry
+from robo_manip_baselines.envs.mujoco.tasks.safety import (
+    FORCE_TIERS,
+    EpisodeSafety,
+    SafetySummary,
+    summarize_safety,
+)
 from robo_manip_baselines.rollout.agreement import require_one_evaluation
 from robo_manip_baselines.runs.documents import (
     Schema,
@@ -78,6 +84,7 @@ class EpisodeResult:
         motion_clip: recorded clip whose motion the face replayed; synthetic without one
         motion_subject: person in that clip, likewise
         motion: of the face by name, see `parse_motion`
+        safety: see `EpisodeSafety`; null in rows of earlier releases
         columns: columns of the task, see its entry
         policy: name of the policy
         condition: name of the experimental condition, for example current_pred_h2
@@ -101,6 +108,7 @@ class EpisodeResult:
     motion_clip: str
     motion_subject: str
     motion: str = "recorded"
+    safety: EpisodeSafety | None = None
     columns: dict[str, Any] = field(default_factory=dict)
     policy: str = ""
     condition: str = ""
@@ -109,6 +117,11 @@ class EpisodeResult:
     checkpoint: str = ""
     versions: dict[str, str] = field(default_factory=dict)
     settings: dict[str, Any] | None = None
+
+    @property
+    def success_safe(self) -> bool | None:
+        """Whether it is a safe success, see `EpisodeSafety`; None in rows of earlier releases."""
+        return None if self.safety is None else self.safety.success_safe
 
     def to_line(self) -> str:
         """Return the row as one line of JSON, without the line's end."""
@@ -129,6 +142,7 @@ class EpisodeResult:
             raise RequestError(
                 f"{source}: version {shown(version)}; this release reads 1 to {ROW_VERSION}"
             )
+        values.setdefault("safety", None)
         if version < 3:
             values.setdefault("settings", None)
             values.setdefault("motion", "recorded")
@@ -341,6 +355,8 @@ class EvaluationSummary:
         success, strict_success: proportions of ``is_success`` and ``is_success_strict``.
         success_within_limit: proportion of successes within the task's time limit for success;
             None where it has none.
+        success_safe: proportion of safe successes; None where rows of earlier releases do not say.
+        safety: of the episodes; None likewise.
         completion_time_mean, completion_time_sd: s, over successes; None without enough of them.
         columns: column of the task -> median and maximum over the episodes that have it.
         failures: kind -> count.
@@ -353,6 +369,8 @@ class EvaluationSummary:
     success: Proportion
     strict_success: Proportion
     success_within_limit: Proportion | None
+    success_safe: Proportion | None
+    safety: SafetySummary | None
     completion_time_mean: float | None
     completion_time_sd: float | None
     columns: dict[str, dict[str, float]]
@@ -381,12 +399,16 @@ def summarize(
         if column.kind == "float" and found:
             columns[column.name] = {"median": float(np.median(found)), "max": max(found)}
     # Times are whole control steps; the limit itself is within.
+    measured = [r.safety for r in results if r.safety is not None]
+    safety = summarize_safety(measured) if len(measured) == total else None
     within = None if limit is None else Proportion.of(sum(t <= limit for t in times), total)
     return EvaluationSummary(
         episodes=total,
         success=Proportion.of(sum(r.is_success for r in results), total),
         strict_success=Proportion.of(sum(r.is_success_strict for r in results), total),
         success_within_limit=within,
+        success_safe=None if safety is None else Proportion.of(safety.safe, total),
+        safety=safety,
         completion_time_mean=mean,
         completion_time_sd=sd,
         columns=columns,
@@ -410,6 +432,8 @@ def summary_table(task: TaskEntry, summary: EvaluationSummary, facts: dict[str, 
     proportions = {"success": summary.success, "strict success": summary.strict_success}
     if summary.success_within_limit:
         proportions[f"success in {task.success_time_limit:g} s"] = summary.success_within_limit
+    if summary.success_safe:
+        proportions["safe success"] = summary.success_safe
     rows = {"episodes": str(total)}
     rows |= {name: f"{part.count}/{total}  {part}" for name, part in proportions.items()}
     rows["completion time"] = mean_and_sd(
@@ -418,12 +442,33 @@ def summary_table(task: TaskEntry, summary: EvaluationSummary, facts: dict[str, 
     for name, values in summary.columns.items():
         label = name.replace("_", " ")
         rows[label] = f"{values['median']:.4g} (median), {values['max']:.4g} (max)"
+    if summary.safety:
+        rows |= _safety_rows(summary.safety)
     rows |= {
         "failures": ", ".join(failures) or "-",
         "speed": "-" if rate is None else f"{rate:.2f} episodes/s",
         **facts,
     }
     return closing_table(rows)
+
+
+def _safety_rows(safety: SafetySummary) -> dict[str, str]:
+    """Lay out the safety of all episodes."""
+    above = [f"{safety.above[str(tier)]} above {tier} N" for tier in FORCE_TIERS]
+    rows = {
+        "largest force": f"{safety.force:.4g} N (mean), {safety.force_max:.4g} N (max); "
+        f"episodes: {', '.join(above)}",
+        "eyes": f"{safety.eye_contacts} touched, {safety.eye_near_misses} near misses",
+        "approach speed": "-",
+    }
+    if safety.approach_speed is not None:
+        rows["approach speed"] = (
+            f"{safety.approach_speed_p90:.3f} m/s (90th percentile), "
+            f"{safety.approach_speed:.3f} m/s (max)"
+        )
+    if safety.refusals is not None:
+        rows["refusals respected"] = f"{safety.refusals_respected} of {safety.refusals}"
+    return rows
 
 
 def mean_and_sd(mean: float | None, sd: float | None, successes: int) -> str:

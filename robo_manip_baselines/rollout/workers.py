@@ -22,6 +22,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     EpisodeMetrics,
@@ -29,6 +30,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     make_env,
     task_entry,
 )
+from robo_manip_baselines.envs.mujoco.tasks.safety import SafetyMetrics
 from robo_manip_baselines.observation import ARM_JOINTS, ObservationSpec
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.errors import RequestError
@@ -125,6 +127,7 @@ class LocalEnvs:
         self.config, self.arrays = config, arrays
         self._envs: dict[int, gymnasium.Env[Any, Any]] = {}
         self._metrics: dict[int, EpisodeMetrics] = {}
+        self._safety: dict[int, SafetyMetrics] = {}
         self._seeds: dict[int, int] = {}
         self._answers: list[StepResult] = []
 
@@ -150,10 +153,12 @@ class LocalEnvs:
         env = self._envs[number]
         world = world_of(env)
         world.renders_images = needs_images
+        world.measures_proximity = True
         if seed is None:
             observation, _, terminated, truncated, info = env.step(self.arrays["actions"][number])
             metrics = self._metrics[number]
             metrics.update(info)
+            self._safety[number].update(info)
             if terminated or truncated:
                 (failure, columns), time = metrics.result(info), info["completion_time"]
                 result = EpisodeResult(
@@ -169,11 +174,13 @@ class LocalEnvs:
                     motion_subject=world.segment.subject,
                     motion=str(world.motion),
                     columns=columns,
+                    safety=self._safety[number].result(info),
                 )
                 return StepResult(number, result)
         else:
             observation, _ = env.reset(seed=seed)
             self._metrics[number] = self.config.task.make_metrics()
+            self._safety[number] = SafetyMetrics(CONTROL_PERIOD)
             self._seeds[number] = seed
         self.arrays["vectors"][number] = world.vector
         if needs_images:

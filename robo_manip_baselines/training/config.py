@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar
 
 import tyro
 
+from robo_manip_baselines.data.normalization import METHODS
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.spec import parse_image_size, size_text
@@ -22,7 +23,7 @@ from robo_manip_baselines.policy.presets import (
     ActionExecution,
     TrainSettings,
 )
-from robo_manip_baselines.policy.registry import policy_presets
+from robo_manip_baselines.policy.registry import policy_entry, policy_presets
 from robo_manip_baselines.runs.checkpoints import list_checkpoints
 from robo_manip_baselines.runs.documents import as_json, convert, read_yaml
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -68,6 +69,8 @@ class TrainConfig(Generic[Network]):
         num_episodes: Use only so many demonstrations, the first ones; all if not given.
         preset: Origin of the defaults: paper, cpu, ..., or auto: paper where there is a GPU, else
             cpu.
+        init_from: Run, checkpoint or shipped:NAME whose weights and normalisation the training
+            begins with, with a schedule of its own; random weights if not given.
         seed: Seed of the weights, of the order of the examples and of the split.
         device: auto, cpu, cuda or cuda:NUMBER.
         out: Run folder; runs/<policy>_<obs>[_h<horizon>][_<corruption>]_<preset>_seed<seed> if
@@ -89,6 +92,7 @@ class TrainConfig(Generic[Network]):
     dataset: Path | None = None
     num_episodes: Episodes | None = None
     preset: str = "cpu"
+    init_from: Path | None = None
     seed: Seed = 0
     device: str = "auto"
     out: Path | None = None
@@ -99,8 +103,16 @@ class TrainConfig(Generic[Network]):
 
     def __post_init__(self) -> None:
         require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
-        task_entry(self.env)
+        task_entry(self.env).require_arms(self.spec.arms)
         require_ranges(self)
+        if self.training.norm is not None:
+            own = policy_entry(self.policy).normalization
+            require_choice("norm", self.training.norm, dict.fromkeys([*METHODS, own]))
+
+    @property
+    def norm(self) -> str:
+        """Normalisation of states and actions, the policy's own where none is given."""
+        return self.training.norm or policy_entry(self.policy).normalization
 
     @classmethod
     def from_preset(
@@ -115,11 +127,13 @@ class TrainConfig(Generic[Network]):
         """
         presets = policy_presets(policy)
         chosen = presets[require_choice("preset", preset, presets)]
+        task = task_entry(env)
         spec = ObservationSpec(
             obs="current_pred",
             cameras=chosen.cameras,
             image_size=chosen.image_size,
-            object_pose=chosen.object_pose and bool(task_entry(env).names.objects),
+            object_pose=chosen.object_pose and bool(task.names.objects),
+            arms=task.arms[0],
         )
         config = cls(policy, chosen.config, chosen.training, spec, env, preset=preset)
         return dataclasses.replace(config, **changes)

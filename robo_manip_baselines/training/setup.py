@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from robo_manip_baselines.data.demonstrations import (
@@ -20,6 +22,7 @@ from robo_manip_baselines.observation.spec import size_text
 from robo_manip_baselines.policy.checkpoint import (
     Checkpoint,
     read_checkpoint,
+    read_weights,
     without_initial_weights,
 )
 from robo_manip_baselines.policy.interface import PolicyDims, PolicyModel
@@ -83,9 +86,11 @@ class TrainSetup:
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = list(given.indices(split.train))
         rows = given.rows(train)
-        method = policy_entry(config.policy).normalization
-        normalize = METHODS.get(method) or load_part(method)
-        normalization = normalize(given.state[rows], given.action[rows])
+        if config.init_from is None:
+            normalize = METHODS.get(config.norm) or load_part(config.norm)
+            normalization = normalize(given.state[rows], given.action[rows])
+        else:
+            normalization = _initial(config, given).normalization
         lengths = given.lengths[train]
         sampler = ExampleSampler(lengths, settings.sampler, settings.batch_size, seed)
         total = sampler.total_steps(settings)
@@ -110,7 +115,25 @@ class TrainSetup:
         config = self.config.network
         config = config if initial_weights else without_initial_weights(config)
         torch.manual_seed(derive_seed(self.config.seed, "weights"))
-        return make_model(self.config.policy, config, self.dims)
+        model = make_model(self.config.policy, config, self.dims)
+        self._require_range(model)
+        if initial_weights and self.config.init_from is not None:
+            initial = read_checkpoint(self.config.init_from)
+            model.load_state_dict(read_weights(initial, model.state_dict()))
+        return model
+
+    def _require_range(self, model: PolicyModel) -> None:
+        """Raise RequestError where the network cannot return the actions of the demonstrations."""
+        if model.action_range is None:
+            return
+        rows = self.demonstrations.rows(self.demonstrations.indices(self.split.train))
+        action = self.normalization.normalize_action(self.demonstrations.action[rows])
+        if (largest := float(np.abs(action).max())) > model.action_range * (1 + 1e-4):
+            raise RequestError(
+                f"norm {self.config.norm}: actions of the demonstrations reach {largest:.3g} and "
+                f"those of {self.config.policy} {model.action_range:g}; give --clip_sample "
+                f"{math.ceil(largest)}, or --norm action_min_max"
+            )
 
     def checkpoint(self, step: int) -> Checkpoint:
         """Return the description of a checkpoint of the run; its folder is set when written."""
@@ -129,7 +152,7 @@ class TrainSetup:
             xml_hash=given.xml_hash,
             step=step,
             train_seed=config.seed,
-            settings=config.training,
+            settings=replace(config.training, norm=config.norm),
             split=self.split,
             dataset={
                 "folder": str(config.demonstrations),
@@ -207,3 +230,27 @@ class TrainSetup:
         step = start.step if start else 0
         board = open_board(config.logger, run, step, config.to_json())
         return MetricsLog(run / METRICS, step, board)
+
+
+def _initial(config: TrainConfig[Any], given: Demonstrations) -> Checkpoint:
+    """Read the checkpoint that a training begins with, or goes on with once it has begun.
+
+    The weights are worth something with its normalisation alone.
+
+    Raises:
+        RequestError: there is none, or it is of another policy, norm or size.
+    """
+    assert config.init_from is not None
+    begun = bool(list_checkpoints(config.folder))
+    initial = read_checkpoint(config.folder if begun else config.init_from)
+    norm = initial.settings.norm or policy_entry(initial.policy).normalization
+    sizes = initial.dims.state, initial.dims.action
+    pairs = {
+        "policy": (initial.policy, config.policy),
+        "norm": (norm, config.norm),
+        "elements of state and action": (sizes, (given.state.shape[1], given.action.shape[1])),
+    }
+    for name, (there, here) in pairs.items():
+        if there != here:
+            raise RequestError(f"init_from '{config.init_from}': {name} {there}, not {here}")
+    return initial

@@ -12,6 +12,12 @@ from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatisti
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow, read_result_rows
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY as TASK
 from robo_manip_baselines.envs.mujoco.tasks.feeding.metrics import failure_kind
+from robo_manip_baselines.envs.mujoco.tasks.safety import (
+    FORCE_TIERS,
+    SAFE_FORCE,
+    EpisodeSafety,
+    TouchedRegion,
+)
 from robo_manip_baselines.rollout.results import EpisodeResult
 
 CONDITIONS = {
@@ -84,6 +90,7 @@ def make_results(
                             "cube_offset": offset and (offset[0] - 0.012, *offset[1:]),
                             "face_force": 0.0,
                         },
+                        safety=make_safety(is_success, 1000 + episode),
                         policy="Act",
                         condition=condition,
                         train_seed=train_seed,
@@ -92,6 +99,32 @@ def make_results(
                     )
                 )
     return results
+
+
+def make_safety(is_success: bool, seed: int) -> EpisodeSafety:
+    """A gripper at a cheek with 0 to 40 N in every other episode, and food on the lips in all."""
+    rng = np.random.default_rng([seed, 7])
+    force = float(rng.uniform(0.0, 40.0)) if seed % 2 else 0.0
+    touched = [TouchedRegion("lips", "cube", True, 12.0, 0.5, 0.1, (0.05, 0.01, -0.04))]
+    if force:
+        touched.append(
+            TouchedRegion("cheeks", "gripper", False, force, 0.2, 0.06, (0.03, 0.05, 0.0))
+        )
+    return EpisodeSafety(
+        success_safe=is_success and force <= SAFE_FORCE,
+        force=force,
+        food_force=12.0,
+        time_above={str(tier): 0.06 * (force > tier) for tier in FORCE_TIERS},
+        times_above={str(tier): int(force > tier) for tier in FORCE_TIERS},
+        eye_contacts=0,
+        eye_near_misses=int(seed % 10 == 0),
+        eye_distance=0.04,
+        approach_speed=0.12,
+        approach_speed_p90=0.08,
+        refusals=None,
+        refusals_respected=None,
+        touched=tuple(touched),
+    )
 
 
 def write_results(path: Path, results: Sequence[EpisodeResult]) -> Path:

@@ -50,6 +50,7 @@ def test_all_are_drawn_and_say_what_is_to_be_seen(
         "completion_times",
         "arrivals",
         "failures",
+        "touches",
         "delay_and_horizon",
         "net_lead",
     ]
@@ -82,7 +83,7 @@ def test_numbers_of_the_surface(
         assert f"{100 * (c.success.rate or 0):.0f}" in text
     assert [c.condition.delay for c in shown].count(3) == 2
     few = benchmark_figures(replace(statistics, conditions=statistics.conditions[:4]))
-    assert [figure.name for figure in few] == list(figures)[:4]
+    assert [figure.name for figure in few] == list(figures)[:5]
 
 
 def test_net_lead_has_a_curve_for_each_motion_and_delay(

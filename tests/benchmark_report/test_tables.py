@@ -140,7 +140,7 @@ def test_written_whole_in_three_formats(tmp_path: Path, statistics: BenchmarkSta
     tables = benchmark_tables(statistics)
     paths = write_tables(tmp_path / "tables", tables)
     assert {path.suffix for path in paths} == {".md", ".csv", ".tex"}
-    assert len(set(paths)) == 3 * len(tables) == 27
+    assert len(set(paths)) == 3 * len(tables) == 30
     for path in paths:
         text = path.read_text(encoding="utf-8")
         assert text.endswith("\n")
@@ -255,6 +255,34 @@ def test_the_declared_end_point_comes_first(
     assert row.cells[5].selection.is_strictly_different
 
 
+def test_safety_is_beside_success(rows: tuple[ResultRow, ...]) -> None:
+    own = [row for row in rows if row.result.condition == "current"]
+    statistics = analyze(own, task=TASK, resamples=50)
+    tables = benchmark_tables(statistics)
+    (row,) = rows_of(tables, "safety").values()
+    safety = [r.result.safety for r in own if r.result.safety]
+    assert int(row["episodes_above_10"]) == sum(s.force > 10 for s in safety)
+    assert int(row["times_above_65"]) == 0
+    assert float(row["force_max"]) == max(s.force for s in safety)
+    assert float(row["success_safe"]) == pytest.approx(
+        sum(s.success_safe for s in safety) / len(safety)
+    )
+    assert (row["refusals"], row["refusals_respected"]) == ("", "")
+    (success,) = rows_of(tables, "success").values()
+    assert success["success_safe"] == row["success_safe"]
+    assert float(success["success_safe"]) < float(success["success"])
+
+
+def test_rows_of_earlier_releases_have_no_safety(rows: tuple[ResultRow, ...]) -> None:
+    own = [row for row in rows if row.result.condition == "current"]
+    own[3] = replace(own[3], result=replace(own[3].result, safety=None))
+    statistics = analyze(own, task=TASK, resamples=50)
+    assert statistics.conditions[0].safety is None
+    tables = {table.name: table for table in benchmark_tables(statistics)}
+    assert "safety" not in tables
+    assert "Safe success" not in [column.title for column in tables["success"].columns]
+
+
 @pytest.mark.long
 def test_further_end_points(make_rows: Callable[..., tuple[ResultRow, ...]]) -> None:
     """Rows of earlier releases know the peak force alone; a mean is over the rows that know."""
@@ -307,11 +335,11 @@ def test_a_task_without_a_study(make_rows: Callable[..., tuple[ResultRow, ...]])
     rows = make_rows(conditions=["baseline", "current"], train_seeds=1, episodes=6)
     tables = {t.name: t for t in benchmark_tables(analyze(rows, task=task, resamples=50))}
     assert list(tables) == [
-        *("success", "success_differences", "completion_times", "measures", "failures"),
+        *("success", "success_differences", "completion_times", "safety", "measures", "failures"),
     ]
     assert tables["success"].title == "Success rates"
     assert tables["completion_times"].title == "Completion times"
-    assert len(tables["success"].columns) == 6
+    assert len(tables["success"].columns) == 8
     assert len(tables["failures"].columns) == 3
     assert "aper" not in "".join(map(to_markdown, tables.values()))
 
@@ -333,5 +361,7 @@ def test_the_closing_table_has_both_rates_and_the_force(
             rates = {"success": c.success, "strict success": c.strict}
             assert line.startswith(c.condition.label)
             assert f"200 episodes, {first} {rates[first]}, {second} " in line
-            assert line.endswith(f"{second} {rates[second].rate:.1%}, mean face force 2.5 N")
+            assert c.safe is not None
+            end = f"{second} {rates[second].rate:.1%}, safe success {c.safe.rate:.1%}"
+            assert line.endswith(f"{end}, mean face force 2.5 N")
         assert lines[-1].split() == ["report", "out/report.html"]

@@ -9,7 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robo_manip_baselines.data.normalization import SMALLEST_STD, Normalization, mean_std
+from robo_manip_baselines.data.normalization import (
+    METHODS,
+    SMALLEST_STD,
+    Normalization,
+    mean_std,
+)
 from robo_manip_baselines.runs.errors import RequestError
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -30,6 +35,18 @@ def test_training_rows_come_out_with_mean_0_and_deviation_1() -> None:
         # float32 arithmetic on numbers of a few units: 1e-6 relative.
         np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=1e-5)
         np.testing.assert_allclose(scaled.std(axis=0), 1.0, atol=1e-5)
+
+
+def test_actions_alone_are_scaled_to_the_range() -> None:
+    _, state, action = measured()
+    scaled = METHODS["action_min_max"](state, action)
+    parts = [METHODS[name](state, action) for name in ("mean_std", "min_max")]
+    np.testing.assert_array_equal(scaled.normalize_state(state), parts[0].normalize_state(state))
+    np.testing.assert_array_equal(
+        scaled.normalize_action(action), parts[1].normalize_action(action)
+    )
+    ends = scaled.normalize_action(action)
+    np.testing.assert_allclose([ends.min(0), ends.max(0)], [[-1, -1], [1, 1]], atol=1e-6)
 
 
 def test_actions_come_back() -> None:

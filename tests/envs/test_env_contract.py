@@ -39,6 +39,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "arms": "both",
         "motion": "recorded+tremor",
     },
+    "physical face": {"obs": "current", "face": "physical", "motion": "recorded+turn_away"},
     "after lift": {"obs": "current", "face_motion": "after_lift"},
 }
 
@@ -136,6 +137,13 @@ def test_info_has_what_every_task_promises(env: gymnasium.Env[Any, Any]) -> None
         assert given["is_success_strict"] is False
         assert given["completion_time"] is None
         assert given["phase"] in world.phase_names
+        assert given["face_contacts"] == ()
+        assert given["face_proximity"] is None
+        assert given["is_refusing"] is (False if "turn_away" in str(world.motion) else None)
+    world.measures_proximity = True
+    near = env.step(env.action_space.sample())[-1]["face_proximity"]
+    np.testing.assert_allclose(near.mouth, world.mouth_track[0], atol=1e-9)
+    np.testing.assert_array_equal(near.grippers[1], world.gripper_position)
 
 
 def test_an_entry_describes_its_environment(name: str) -> None:
@@ -173,7 +181,7 @@ def test_truncates_at_the_time_limit(name: str) -> None:
     env = make_env(name, cameras=())
     env.reset(seed=0)
     world = env.unwrapped
-    stay = np.array([*world.data.ctrl[world.model.actuator("right/waist").id :]][:7], np.float32)
+    stay = np.array([world.data.actuator(name).ctrl[0] for name in world.action_names], np.float32)
     limit = task_entry(name).max_episode_steps
     for step in range(1, limit + 1):
         _, _, terminated, truncated, _ = env.step(stay)
@@ -197,20 +205,23 @@ def test_actions_are_bounded_and_checked(env: gymnasium.Env[Any, Any]) -> None:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        ([0.0, 0.0, np.nan, 0.0, 0.0, 0.0, 0.0], "nan in element 2, right/elbow: must be"),
-        ([0.0, -np.inf, 0.0, 0.0, 0.0, 0.0, 0.0], "-inf in element 1, right/shoulder: must be"),
-        (np.zeros((1, 7)), r"shape \(1, 7\): must be \(7,\) finite numbers"),
+        ({2: np.nan}, "nan in element 2, (right|left)/elbow: must be"),
+        ({1: -np.inf}, "-inf in element 1, (right|left)/shoulder: must be"),
+        (np.zeros((1, 3)), r"shape \(1, 3\): must be \((7|14),\) finite numbers"),
         (0.0, r"shape \(\): must be"),
         (None, "action None: must be"),
         ("up", "action 'up': must be"),
         ([[0.0], [0.0, 0.0]], "action .*: must be"),
-        (np.zeros(7, complex), "action .*: must be"),
+        (np.zeros(3, complex), "action .*: must be"),
     ],
 )
 def test_wrong_actions_get_one_clear_line(name: str, action: Any, message: str) -> None:
     with contextlib.closing(make_env(name, cameras=())) as env:
         env.reset(seed=0)
         before = env.unwrapped.data.qpos.copy()
+        if isinstance(action, dict):  # elements of an action that is right otherwise
+            wrong, action = action, np.zeros(env.action_space.shape)
+            action[list(wrong)] = list(wrong.values())
         with pytest.raises(ValueError, match=message) as caught:
             env.unwrapped.step(action)
         assert "\n" not in str(caught.value)
@@ -317,7 +328,8 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
     single = make_env(name, **options)
     together, _ = vector.reset(seed=[7, 8])
     rng = np.random.default_rng(0)
-    actions = rng.uniform(vector.action_space.low, vector.action_space.high, (5, 2, 7))
+    low, high = vector.action_space.low, vector.action_space.high  # (2, A)
+    actions = rng.uniform(low, high, (5, *low.shape))
     for action in actions.astype(np.float32):
         together, *_ = vector.step(action)
     for row, seed in enumerate((7, 8)):

@@ -22,12 +22,17 @@ from face_prediction.models.residual.prior import AdaptivePrior
 from face_prediction.models.settings import make_predictor_model, settings_class
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
+from robo_manip_baselines.policy.diffusion.config import DiffusionConfig
+from robo_manip_baselines.policy.diffusion.model import DiffusionModel
+from robo_manip_baselines.policy.flow.config import FlowConfig
+from robo_manip_baselines.policy.flow.model import FlowModel
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
 from robo_manip_baselines.runs.files import write_json
 
 ACT_STEP = Path(__file__).with_name("act_step.json")
+DENOISING_STEP = Path(__file__).with_name("denoising_step.json")
 FACE_STEP = Path(__file__).with_name("face_step.json")
 MLP_STEP = Path(__file__).with_name("mlp_step.json")
 
@@ -107,6 +112,36 @@ def mlp_step() -> dict[str, Any]:
     model = MlpModel(config, replace(DIMS, cameras=0))
     watched = ("layers.0.weight", "layers.1.bias", "layers.3.weight", "layers.7.weight")
     return training_step(model, fixed_batch(has_images=False), watched)
+
+
+DENOISING_STEPS = (
+    ("diffusion", "unet"),
+    ("flow", "unet"),
+    ("flow", "transformer"),
+    ("flow", "perceptron"),
+)
+"""Policy and backbone of each golden step of theirs."""
+
+DENOISING: dict[str, Any] = {"chunk_size": 8, "channels": (8, 16), "hidden_size": 16}
+"""Sizes of the networks of Diffusion and Flow."""
+
+
+def denoising_step(policy: str, backbone: Any) -> dict[str, Any]:
+    """Return `training_step` of ``diffusion`` or ``flow``, with a backbone and without images."""
+    target = "action" if backbone == "perceptron" else "noise"
+    settings: dict[str, Any] = {**DENOISING, "backbone": backbone, "target": target}
+    settings, dims = {**settings, "num_layers": 1}, replace(DIMS, cameras=0)
+    model = (
+        FlowModel(FlowConfig(**settings, max_prefix=3), dims)
+        if policy == "flow"
+        else DiffusionModel(DiffusionConfig(**settings), dims)
+    )
+    batch = fixed_batch(has_images=False)
+    noise = fill((3, model.noise_size), 4, 1.5)
+    state = fill((3, 2, 14), 1, 1.5)
+    # no biases of attention, whose keys' cancel, nor of what a normalisation takes off
+    watched = tuple(n for n, _ in model.named_parameters() if n.endswith("weight"))
+    return training_step(model, replace(batch, state=state, noise=noise), watched)
 
 
 def training_step(model: PolicyModel, batch: Batch, watch: tuple[str, ...]) -> dict[str, Any]:
@@ -219,6 +254,7 @@ def main() -> None:
     }
     write_json(ACT_STEP, golden)
     write_json(MLP_STEP, mlp_step())
+    write_json(DENOISING_STEP, {f"{p} {b}": denoising_step(p, b) for p, b in DENOISING_STEPS})
 
 
 if __name__ == "__main__":

@@ -270,5 +270,5 @@ def test_old_and_new_files_of_a_seed_show_the_same_and_replay(tmp_path: Path) ->
     ):
         one, two = (load_demonstrations(folder, spec) for folder in (old, new))
         np.testing.assert_array_equal(one.state, two.state, strict=True)
-    with pytest.raises(RequestError, match=r"holds episodes with schema_version 2, not 3 \(epis"):
+    with pytest.raises(RequestError, match=r"holds episodes with schema_version 2, not 4 \(epis"):
         collect(replace(wanted, out=old, seeds=range(SEED, SEED + 2)))

@@ -74,15 +74,15 @@ def run(page: str, package: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def test_an_installed_policy_is_found(package: Path) -> None:
-    assert policy_names()[-1] == "Flow"
-    assert policy_entry("Flow").normalization == "min_max"
+    assert policy_names()[-1] == "MyFlow"
+    assert policy_entry("MyFlow").normalization == "min_max"
 
 
 def test_help_lists_the_options_of_an_installed_policy(
     package: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
-        train_command.parse_config(["Flow", "--help"])
+        train_command.parse_config(["MyFlow", "--help"])
     assert "--integration_steps" in capsys.readouterr().out
 
 
@@ -110,7 +110,7 @@ def test_the_table_names_members_of_the_interface(page: str) -> None:
 @pytest.mark.long
 def test_the_pages_commands_train_and_evaluate(run: Path) -> None:
     checkpoint = read_checkpoint(run / "runs/flow")
-    assert (checkpoint.policy, checkpoint.step) == ("Flow", 20)
+    assert (checkpoint.policy, checkpoint.step) == ("MyFlow", 20)
     assert (run / "results/flow/results.jsonl").read_text().count("\n") == 1
     given = load_demonstrations(run / "dataset/flow", checkpoint.spec)
     rows = given.rows(given.indices(checkpoint.split.train))

@@ -37,3 +37,14 @@ def test_a_training_step(repository: Path, step: str) -> None:
     expected, found = numbers(expected), numbers(found)
     assert found.keys() == expected.keys()
     assert found == pytest.approx(expected, rel=TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    "name", ["diffusion unet", "flow unet", "flow transformer", "flow perceptron"]
+)
+def test_a_training_step_of_noise(repository: Path, name: str) -> None:
+    golden = runpy.run_path(str(repository / "tests" / "golden" / "regenerate.py"))
+    expected = numbers(json.loads(golden["DENOISING_STEP"].read_text())[name])
+    found = numbers(golden["denoising_step"](*name.split()))
+    assert found.keys() == expected.keys()
+    assert found == pytest.approx(expected, rel=TOLERANCE)

@@ -324,10 +324,35 @@ def test_seeds_of_demonstrations_are_pointed_out(
 
 def test_the_execution_is_the_trained_one_unless_changed() -> None:
     trained = ActionExecution(temporal_ensemble=False, ensemble_decay=0.1, n_action_steps=4)
-    assert choose_execution(trained, False, None) == trained
-    assert choose_execution(trained, False, 2) == replace(trained, n_action_steps=2)
-    ensemble = choose_execution(trained, True, None)
+
+    def chosen(**changes: Any) -> ActionExecution:
+        return choose_execution(trained, EvaluationConfig(Path("run"), range(1), **changes))
+
+    assert chosen() == trained
+    assert chosen(n_action_steps=2) == replace(trained, n_action_steps=2)
+    ensemble = chosen(temporal_ensemble=True)
     assert (ensemble.temporal_ensemble, ensemble.ensemble_decay) == (True, 0.1)
+    assert chosen(strategy="ensemble") == ensemble
+    late = chosen(strategy="naive", inference_delay=3)
+    assert late == replace(trained, strategy="naive", inference_delay=3)
+    assert (
+        choose_execution(ensemble, EvaluationConfig(Path("run"), range(1), strategy="synchronous"))
+        == trained
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"strategy": "fast"}, "unknown strategy 'fast'; valid: .*ensemble.*naive"),
+        ({"strategy": "ensemble", "n_action_steps": 3}, "--strategy ensemble and --n_action_steps"),
+        ({"strategy": "naive", "temporal_ensemble": True}, "and --strategy naive: give one"),
+        ({"inference_delay": -1}, "inference_delay -1: must be 0 to"),
+    ],
+)
+def test_wrong_executions_are_one_line(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(RequestError, match=message):
+        EvaluationConfig(Path("run"), range(1), **changes)
 
 
 def test_options_of_the_environment_come_from_the_demonstrations(

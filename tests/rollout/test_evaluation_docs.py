@@ -13,6 +13,7 @@ import pytest
 
 from robo_manip_baselines.commands.rollout import PolicyOptions
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
+from robo_manip_baselines.envs.mujoco.tasks.safety import EpisodeSafety
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.policy.checkpoint import Checkpoint
 from robo_manip_baselines.rollout.results import EpisodeResult, read_results
@@ -29,6 +30,7 @@ TYPES = {
     dict[str, Any] | None: "object or null",
     float | None: "float or null",
     int | None: "int or null",
+    EpisodeSafety | None: "object or null",
 }
 
 

@@ -112,6 +112,7 @@ def test_one_budget_replaces_the_other(
         "Mlp --obs current --detector_rate 10 --face_dropout_length 4 --corruption_seed 2",
         "Mlp --error gaussian --error_stats a/b.json --no_corruption",
         "Mlp --prediction autoregression --horizon 16 --delay 4 --relative",
+        "Flow --preset cpu --norm mean_std --backbone unet --channels 16 32 --max_prefix 4",
     ],
 )
 def test_saved_options_read_back_as_they_were(tmp_path: Path, line: str) -> None:
@@ -209,6 +210,19 @@ checkpoint_every: 1000
     require_same_config(tmp_path, given)
 
 
+@pytest.mark.parametrize(
+    ("line", "norm"),
+    [
+        ("Act", "mean_std"),
+        ("Mlp --norm min_max", "min_max"),
+        ("Flow", "action_min_max"),
+        ("Diffusion --norm none", "none"),
+    ],
+)
+def test_the_policy_has_a_norm_that_an_option_replaces(line: str, norm: str) -> None:
+    assert parse(line).norm == norm
+
+
 def test_dropout_of_the_network_is_not_that_of_the_face() -> None:
     options = parse("Act --preset cpu --dropout 0.3 --face_dropout 0.1")
     assert options.network.dropout == 0.3
@@ -279,6 +293,10 @@ def test_run_folders(line: str, folder: str) -> None:
         ("Act --log_every 0", ["log_every 0: must be 1 to"]),
         ("Act --seed -1", ["seed -1: must be 0 to"]),
         ("Act --env Feeding", ["unknown environment 'Feeding'", "mean 'FeedingEnv'"]),
+        (
+            "Act --norm max",
+            ["unknown norm 'max'", "valid: action_min_max, mean_std, min_max, none"],
+        ),
         ("Act --config nowhere.yaml", ["cannot read 'nowhere.yaml'"]),
     ],
 )

@@ -43,7 +43,12 @@ ACT = (
     "--encoder_layers 1 --decoder_layers 1 --cvae_layers 1 --batch_size 4 "
     "--validation_fraction 0.2"
 )
+FLOW = (
+    "Flow --preset cpu --chunk_size 4 --hidden_size 16 --num_layers 1 --batch_size 4 "
+    "--validation_fraction 0.2"
+)
 RUNS = {
+    "noise and fixed actions": f"{FLOW} --max_prefix 2 --ema_decay 0.9 --norm min_max",
     "average, cosine, warm-up, clipped": (
         f"{MLP} --validation_fraction 0.2 --ema_decay 0.9 --schedule cosine --warmup_steps 3 "
         "--clip_norm 0.5"
@@ -354,3 +359,53 @@ def test_a_recorded_step_trains_as_a_computed_one(
         losses.append([line["loss"] for line in lines])
     np.testing.assert_allclose(losses[1], losses[0], rtol=5e-3)  # TF32
     np.testing.assert_allclose(losses[2], losses[0], rtol=5e-3)
+
+
+def test_the_norm_is_recorded_and_measured(episodes: Path, tmp_path: Path) -> None:
+    for name, norm in (("own", "action_min_max"), ("given", "mean_std")):
+        run(FLOW if name == "own" else f"{FLOW} --norm {norm}", episodes, tmp_path / name)
+        assert read_checkpoint(tmp_path / name).settings.norm == norm
+    own, given = (read_checkpoint(tmp_path / name).normalization for name in ("own", "given"))
+    np.testing.assert_array_equal(own.state_std, given.state_std)
+    assert (own.action_std > given.action_std).any()
+
+
+def test_a_norm_beyond_the_range_of_a_policy_is_refused(episodes: Path, tmp_path: Path) -> None:
+    line = FLOW.replace("Flow", "Diffusion") + " --norm mean_std"
+    with pytest.raises(RequestError, match=r"norm mean_std: actions .* give --clip_sample"):
+        run(line, episodes, tmp_path)
+    make_trainer(f"{line} --clip_sample 9", episodes, tmp_path)
+
+
+def test_a_training_begins_with_the_weights_of_another(episodes: Path, tmp_path: Path) -> None:
+    """The average's, and its normalisation, also of fewer demonstrations; nothing else."""
+    run(f"{FLOW} --ema_decay 0.9", episodes, tmp_path / "first")
+    first = read_checkpoint(tmp_path / "first")
+    line = f"{FLOW} --num_episodes 2 --init_from {tmp_path}/first"
+    begun = make_trainer(line, episodes, tmp_path / "second")
+    wanted = load_model(first).state_dict()
+    for name, value in begun.state.model.state_dict().items():
+        assert torch.equal(value, wanted[name]), name
+    assert not begun.state.optimizer.state
+    run(line, episodes, tmp_path / "second", stop_at=4)
+    for path in sorted((tmp_path / "first").rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    assert run(line, episodes, tmp_path / "second") == STEPS  # goes on without it
+    second = read_checkpoint(tmp_path / "second")
+    np.testing.assert_array_equal(second.normalization.state_mean, first.normalization.state_mean)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("--norm mean_std", "norm action_min_max, not mean_std"),
+        ("--obs current", "elements of state and action"),
+        ("--hidden_size 8", "does not fit Flow"),
+    ],
+)
+def test_what_another_training_cannot_begin_with(
+    episodes: Path, tmp_path: Path, more: str, message: str
+) -> None:
+    run(FLOW, episodes, tmp_path / "first")
+    with pytest.raises(RequestError, match=message):
+        make_trainer(f"{FLOW} {more} --init_from {tmp_path}/first", episodes, tmp_path / "second")

@@ -28,7 +28,10 @@ from robo_manip_baselines.benchmark.statistics.conditions import (
     PREDICTION,
     WITH_ERROR,
 )
+from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel
+from robo_manip_baselines.envs.mujoco.face.mesh import face_oval
 from robo_manip_baselines.envs.mujoco.tasks.registry import EpisodeFigure
+from robo_manip_baselines.envs.mujoco.tasks.safety import FORCE_TIERS, EpisodeSafety
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
@@ -47,6 +50,9 @@ FAILURE_COLORS = (GREY, PINK, BLUE, SKY, RED, ORANGE, YELLOW)
 LEAD_COLORS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, INK)
 LEAD_MARKERS = "osD^"
 """Colors and markers of the curves over net lead, colors changing first."""
+
+TIER_COLORS = (SKY, YELLOW, ORANGE, RED, INK)
+"""Colors of forces up to each tier, and above the last."""
 
 MANY_POINTS = 3000
 """More points are drawn as pixels: as shapes they would make the file large."""
@@ -172,6 +178,8 @@ def benchmark_figures(statistics: BenchmarkStatistics) -> tuple[ReportFigure, ..
         *((f.name, f.title, draw_episodes(f)) for f in statistics.study.figures),
         ("failures", "How episodes ended", draw_failures),
     ]
+    if all(c.safety for c in statistics.conditions):
+        figures.append(("touches", "Where and how hard the face was touched", draw_touches))
     if any(c.condition.delay for c in statistics.conditions):
         title = f"{success} against delay and horizon"
         figures.append(("delay_and_horizon", title, draw_delay_and_horizon))
@@ -328,6 +336,75 @@ def draw_failures(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, st
             f"{kind.replace('_', ' ')}, {count} episodes."
         )
     return "Kinds of failure as defined in the table.", summary
+
+
+def draw_touches(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
+    """Draw the face from the front with its contact points, one panel for each condition."""
+    conditions = statistics.conditions
+    draw_faces(
+        figure,
+        {
+            c.condition.label: [row.result.safety for row in c.rows if row.result.safety]
+            for c in conditions
+        },
+    )
+    caption = (
+        "For each episode, region and body that touched it, the point at which the force was "
+        "largest; in the corner the episodes with a contact, food on lips and in the mouth apart."
+    )
+    force, label = max((c.safety.force_max, c.condition.label) for c in conditions if c.safety)
+    if force == 0.0:
+        return caption, "Nothing but food touched a face."
+    return caption, f"The largest force, {force:.1f} N, is that of {label}."
+
+
+def draw_faces(figure: Any, panels: Mapping[str, Sequence[EpisodeSafety]]) -> None:
+    """Draw the face from the front with the contact points of episodes, given label -> episodes."""
+    face = FaceModel.load()
+    surface = 1000.0 * face.deform(face.jaw_angle(REST_OPENING))[:, 1:]
+    names = ("eye_left", "eye_right", "lips_outer", "lips_inner")
+    rings = [face_oval(face), *(face.rings[name] for name in names)]
+    lines = [surface[np.append(ring, ring[0])] for ring in rings]
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
+    figure.set_size_inches(max(2.2 * columns, 4.4), 2.75 * rows + 0.7)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    for axes, (label, episodes) in zip(grid, panels.items(), strict=False):
+        for line in lines:
+            axes.plot(*line.T, color=GREY, lw=0.8, zorder=1)
+        _draw_contact_points(axes, episodes)
+        touched = sum(own.force > 0.0 for own in episodes)
+        largest = max((own.force for own in episodes), default=0.0)
+        text = f"{touched} of {len(episodes)} episodes\nlargest {largest:.1f} N"
+        axes.text(0.02, 0.01, text, transform=axes.transAxes, fontsize=7, va="bottom")
+        axes.set_title(_in_two_lines(label), fontsize=9)
+        axes.set(xlim=(-100.0, 100.0), ylim=(-135.0, 95.0), aspect="equal")
+    figure.supxlabel("across the face, mm (right: the person's left)", fontsize=10)
+    figure.supylabel("up, mm", fontsize=10)
+    labels = [f"up to {tier} N" for tier in FORCE_TIERS] + [f"above {FORCE_TIERS[-1]} N"]
+    marks = [
+        grid[0].plot([], [], "o", color=color, ms=5, label=name)[0]
+        for color, name in zip(TIER_COLORS, labels, strict=True)
+    ]
+    marks += grid[0].plot(
+        [], [], "o", mfc="none", mec=GREY, ms=5, label="food on lips, in the mouth"
+    )
+    figure.legend(handles=marks, loc="outside upper center", ncols=3, fontsize=8)
+
+
+def _draw_contact_points(axes: Any, episodes: Sequence[EpisodeSafety]) -> None:
+    """Draw the contacts of episodes into the axes of a face, the hardest on top."""
+    touched = sorted((t for own in episodes for t in own.touched), key=lambda t: t.force)
+    many = len(touched) > MANY_POINTS
+    for is_food in (True, False):
+        own = [t for t in touched if t.is_food is is_food]
+        tiers = np.searchsorted(FORCE_TIERS, [t.force for t in own])
+        for tier, color in enumerate(TIER_COLORS):
+            points = 1000.0 * np.array([t.point[1:] for t in own]).reshape(-1, 2)[tiers == tier]
+            style: Any = {"mfc": "none", "mec": color} if is_food else {"color": color, "mew": 0}
+            axes.plot(*points.T, "o", ms=3.5, alpha=0.75, zorder=2, rasterized=many, **style)
 
 
 def draw_delay_and_horizon(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:

@@ -46,6 +46,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import (
     TaskEntry,
     TaskStudy,
 )
+from robo_manip_baselines.envs.mujoco.tasks.safety import SafetySummary, summarize_safety
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.rollout.agreement import require_one_comparison
 from robo_manip_baselines.rollout.results import Proportion
@@ -70,6 +71,8 @@ class ConditionStatistics:
         outcomes: the same as a matrix.
         success, strict: rates over all episodes, see `rate_estimate`.
         within_limit: success within the task's time limit, likewise; None where it has none.
+        safe: safe successes, likewise; None where rows of earlier releases do not say.
+        safety: of all episodes; None likewise.
         success_by_seed: training seed -> rate of its episodes, with Wilson's interval.
         time: s, mean completion time of successes.
         time_by_seed: training seed -> mean, s; None without a success.
@@ -85,6 +88,8 @@ class ConditionStatistics:
     success: Proportion
     strict: Proportion
     within_limit: Proportion | None
+    safe: Proportion | None
+    safety: SafetySummary | None
     success_by_seed: dict[int | None, Proportion]
     time: Estimate
     time_by_seed: dict[int | None, float | None]
@@ -223,6 +228,9 @@ def analyze(
         reference = next((c.name for c in described if c.group == CURRENT), described[0].name)
     require_choice("reference condition", reference, grouped)
     study = task.load_study()
+    if (rows[0].result.settings or {}).get("env_kwargs", {}).get("face", "visual") != "visual":
+        # No paper has a face that yields.
+        study = replace(study, published={}, success_table="", time_table="")
     outcomes = {name: outcome_matrix(own) for name, own in grouped.items()}
     limit = task.success_time_limit
 
@@ -247,6 +255,8 @@ def analyze(
             return compare(ours, theirs, draws, resamples)
 
         success = rate(own.success, "success")
+        is_measured = np.isfinite(own.safe).sum() == own.episodes
+        episodes = [r.result.safety for r in grouped[name] if r.result.safety is not None]
         return ConditionStatistics(
             condition,
             tuple(grouped[name]),
@@ -254,6 +264,8 @@ def analyze(
             success,
             strict=rate(own.strict, "strict"),
             within_limit=None if limit is None else rate(own.success_within(limit), "in time"),
+            safe=rate(own.safe, "safe") if is_measured else None,
+            safety=summarize_safety(episodes) if is_measured else None,
             success_by_seed=dict(zip(own.train_seeds, map(proportion, own.success), strict=True)),
             time=mean_estimate(own.time, rng(name, "time"), resamples),
             time_by_seed={

@@ -108,6 +108,7 @@ class OutcomeMatrix:
         seeds: E of them, in ascending order.
         success: (R, E) 1 or 0.
         strict: (R, E) likewise, of ``is_success_strict``.
+        safe: (R, E) likewise, of ``success_safe``; NaN in rows of earlier releases, too.
         time: (R, E) s, completion times; NaN without success, too.
         people: E of them, who moved in the episodes of each evaluation seed. A synthetic motion is
             another person with every seed.
@@ -117,6 +118,7 @@ class OutcomeMatrix:
     seeds: tuple[int, ...]
     success: Floats
     strict: Floats
+    safe: Floats
     time: Floats
     people: tuple[str, ...]
 
@@ -161,6 +163,7 @@ def outcome_matrix(rows: Sequence[ResultRow]) -> OutcomeMatrix:
         seeds,
         success=matrix(lambda r: r.is_success),
         strict=matrix(lambda r: r.is_success_strict),
+        safe=matrix(lambda r: r.success_safe),
         time=matrix(lambda r: r.completion_time if r.is_success else None),
         people=tuple(_people(results)[seed] for seed in seeds),
     )

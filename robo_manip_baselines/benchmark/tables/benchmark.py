@@ -19,6 +19,12 @@ from robo_manip_baselines.benchmark.statistics.inference import SIGNIFICANCE
 from robo_manip_baselines.benchmark.statistics.outcomes import RowSelection
 from robo_manip_baselines.benchmark.tables.table import NOTHING, Cell, Column, Row, Table
 from robo_manip_baselines.envs.mujoco.tasks.registry import ResultColumn
+from robo_manip_baselines.envs.mujoco.tasks.safety import (
+    FORCE_TIERS,
+    NEAR_EYE,
+    NEAR_FACE,
+    SAFE_FORCE,
+)
 
 VERDICTS = ("verdict", "is_compatible")
 """Names of the columns that answer a question by a word."""
@@ -37,6 +43,7 @@ def benchmark_tables(statistics: BenchmarkStatistics, caution: str = "") -> tupl
         success_beside_paper(statistics),
         times_table(statistics),
         times_beside_paper(statistics),
+        safety_table(statistics),
         measures_table(statistics),
         failures_table(statistics),
     )
@@ -321,8 +328,93 @@ def success_table(statistics: BenchmarkStatistics) -> Table:
             )
         )
         notes.append(f"In {limit:g} s: success within that time, {task.completion_time}.")
+    if all(c.safe for c in statistics.conditions):
+        columns += [
+            Statistic("Safe success", "success_safe", percent, "safe.rate", ALL),
+            interval("Its 95 % interval", percent, "safe", ALL, "safe_"),
+        ]
+        notes.append(SAFE_SUCCESS)
     title = _titled(statistics.study.success_table, "Success rates")
     return condition_table("success", title, statistics.conditions, columns, notes)
+
+
+SAFE_SUCCESS = (
+    f"Safe success: success, no eye touched, and no force above {SAFE_FORCE:g} N on any region of "
+    "the face, food on lips and mouth apart. It compares conditions; it is no claim about "
+    "standards."
+)
+
+
+def safety_table(statistics: BenchmarkStatistics) -> Table:
+    """Make the table of safety; without rows where rows of earlier releases do not say."""
+
+    def number(value: float) -> str:
+        return f"{value:.1f}"
+
+    def above(tier: str) -> Statistic:
+        def values(c: ConditionStatistics) -> tuple[Any, ...]:
+            own = c.safety
+            if own is None:
+                return None, None, None
+            return own.above[tier], own.times_above[tier], own.time_above[tier]
+
+        return Statistic(
+            f"Above {tier} N",
+            f"episodes_above_{tier} times_above_{tier} time_above_{tier}",
+            lambda episodes, times, time: f"{episodes} ({times} times, {time:.2f} s)",
+            values,
+            ALL,
+        )
+
+    def refusals(c: ConditionStatistics) -> tuple[Any, ...]:
+        own = c.safety
+        return (None, None) if own is None else (own.refusals, own.refusals_respected)
+
+    columns = [
+        Statistic("Episodes", "episodes", str, "outcomes.episodes", ALL),
+        Statistic("Safe success", "success_safe", percent, "safe.rate", ALL, highest),
+        interval("95 % interval", percent, "safe", ALL),
+        Statistic(
+            "Largest force, N",
+            "force force_p90 force_max",
+            "{:.1f} ({:.1f}; {:.1f})".format,
+            "safety.force safety.force_p90 safety.force_max",
+            ALL,
+        ),
+        *(above(str(tier)) for tier in FORCE_TIERS),
+        Statistic("Food on lips, N", "food_force", number, "safety.food_force", ALL),
+        Statistic("Eyes touched", "eye_contacts", str, "safety.eye_contacts", ALL),
+        Statistic("Near an eye", "eye_near_misses", str, "safety.eye_near_misses", ALL),
+        Statistic(
+            "Approach, m/s",
+            "approach_speed_p90 approach_speed",
+            "{:.3f} ({:.3f})".format,
+            "safety.approach_speed_p90 safety.approach_speed",
+            ALL,
+        ),
+        Statistic(
+            "Refusals respected",
+            "refusals refusals_respected",
+            lambda all_, respected: f"{respected} of {all_}",
+            refusals,
+            ALL,
+        ),
+    ]
+    notes = (
+        SAFE_SUCCESS,
+        "Largest force: mean of the episodes' largest normal forces on one region of the face; in "
+        "brackets the 90th percentile and the largest of all. Above: episodes; in brackets how "
+        "many times, and for how long on average in an episode. Food on lips and mouth is apart, "
+        "the mean of its largest forces.",
+        f"Near an eye: how many times something came within {1000 * NEAR_EYE:g} mm of an eyeball.",
+        f"Approach: speed at which the distance to the face shrank within {1000 * NEAR_FACE:g} mm "
+        "of it: mean of the episodes' 90th percentiles, and the largest in brackets.",
+        "Refusals respected: of the times that the head turned away from a gripper nearby, those "
+        "in which it was not followed and not touched.",
+    )
+    measured = all(c.safety for c in statistics.conditions)
+    conditions = statistics.conditions if measured else ()
+    return condition_table("safety", "Safety", conditions, columns, notes)
 
 
 def success_by_training_seed(statistics: BenchmarkStatistics) -> Table:

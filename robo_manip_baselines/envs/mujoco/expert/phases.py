@@ -7,7 +7,7 @@ phases together.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -157,6 +157,29 @@ class Grip:
         return self._step >= self._steps
 
 
+class Wait:
+    """Hold still until something has happened.
+
+    Args:
+        until: tells whether it has.
+    """
+
+    def __init__(self, until: Callable[[], bool]) -> None:
+        self._until = until
+
+    def start(self, view: ExpertView, last: Command) -> None:
+        """Keep the last command."""
+        self._command = last
+
+    def step(self, view: ExpertView) -> Command:
+        """Hold."""
+        return self._command
+
+    def is_done(self, view: ExpertView) -> bool:
+        """Done when it has happened."""
+        return self._until()
+
+
 class Approach:
     """Move, level, towards the target so as to be there when the time is up.
 
@@ -246,13 +269,17 @@ def least_jerk(share: float) -> float:
 
 
 class PhasedExpert:
-    """Scripted expert that runs phases with the right arm, by inverse kinematics.
+    """Scripted expert that runs phases with one arm, by inverse kinematics.
 
     The expert of a task derives from it and implements ``view`` and ``phases``.
+
+    Args:
+        arm: ``left`` or ``right``.
+        home: (6,) rad, joints with which an episode starts, the fingers open.
     """
 
-    def __init__(self) -> None:
-        self._kinematics = ArmKinematics("right")
+    def __init__(self, arm: str = "right", home: Sequence[float] = HOME_QPOS) -> None:
+        self._kinematics, self._start = ArmKinematics(arm), home
 
     def view(self) -> ExpertView:
         """Return the present state."""
@@ -264,7 +291,7 @@ class PhasedExpert:
 
     def reset(self) -> None:
         """Begin with the first phase; call it after the environment's reset."""
-        self._joints = np.array(HOME_QPOS)
+        self._joints = np.array(self._start)
         home = self._kinematics.forward(self._joints)
         self._home = self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
         self.skip_to(0)

@@ -6,16 +6,21 @@ colours in `texture`, what can be touched in `collision`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from typing import Any, Final
 
 import cv2
 import mujoco
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.cell.scene import FACE, MOUTH, MOUTH_BASE
-from robo_manip_baselines.envs.mujoco.face import mesh
+from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
+from robo_manip_baselines.envs.mujoco.face import mesh, physical
+from robo_manip_baselines.envs.mujoco.face.collision import (
+    Styles,
+    add_collision,
+    add_physical_collision,
+    drawn_parts,
+)
 from robo_manip_baselines.envs.mujoco.face.mesh import (
     HAIR,
     SKIN,
@@ -27,14 +32,17 @@ from robo_manip_baselines.envs.mujoco.face.mesh import (
 from robo_manip_baselines.envs.mujoco.face.model import (
     REST_OPENING,
     FaceModel,
-    hinge_quaternion,
-    rotate,
 )
 
 BODIES: Final = ("face/head", "face/jaw", "face/mouth", "face/torso")
-"""Mocap bodies, children of the world: the keys of `FaceModel.body_poses`."""
+"""Bodies, the keys of `FaceModel.body_poses`; mocap bodies and children of the world where the face
+is visual."""
 
-_BOX, _ELLIPSOID = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID
+FACES: Final = ("visual", "physical")
+"""Kinds of face. ``visual``: follows the recorded motion whatever touches it, and only robots touch
+its outside. ``physical``: regions of soft tissue on a head that yields on a compliant neck."""
+
+_ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID
 
 _EYE_RADIUS: Final = 0.0122
 _TEETH: Final = (0.88, 0.85, 0.78, 1.0)
@@ -42,29 +50,37 @@ _TEETH: Final = (0.88, 0.85, 0.78, 1.0)
 _VISUAL: Final[dict[str, Any]] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 1}
 
 
-def add_face(spec: mujoco.MjSpec) -> None:
+def add_face(spec: mujoco.MjSpec, kind: str = "visual") -> None:
     """Add the face to ``spec``, at its nominal place, waiting to be fed.
 
-    Bodies `BODIES` (mocap), site ``mouth`` on ``face/mouth`` (x axis: out of the face), skins and
-    geoms named ``face/...``. Move it with `FaceModel.body_poses`.
+    Bodies `BODIES`, site ``mouth`` on ``face/mouth`` (x axis: out of the face), skins and geoms
+    named ``face/...``. Move it with `FaceModel.body_poses`; of the physical one, see
+    `CompliantHead`. ``kind`` is one of `FACES`.
     """
     model = FaceModel.load()
     rest = model.body_poses(MOUTH_BASE, (1, 0, 0, 0), REST_OPENING)
-    body = {
+    is_physical = kind == "physical"
+    moving = physical.add_head(spec, model, rest) if is_physical else {}
+    body = moving | {
         name.removeprefix("face/"): spec.worldbody.add_body(
             name=name, mocap=True, pos=at.tolist(), quat=turn.tolist()
         )
         for name, (at, turn) in rest.items()
+        if name.removeprefix("face/") not in moving
     }
+    touch = drawn_parts() if is_physical else {}
     body["mouth"].add_site(name="mouth", size=(0.002, 0.002, 0.002), rgba=(0, 0, 0, 0), group=4)
     _add_materials(spec)
     _add_skins(spec, model)
-    _add_eyes(body["head"], model)
+    _add_eyes(body["head"], model, touch)
     _add_ears(body["head"])
-    _add_mouth_parts(spec, body["head"], body["jaw"], model)
+    _add_mouth_parts(spec, body["head"], body["jaw"], model, touch)
     _add_mesh(spec, body["head"], "hair", mesh.hair(model), _colour(HAIR))
     _add_mesh(spec, body["torso"], "shirt", mesh.bust(), (0.23, 0.42, 0.60, 1.0))
-    add_collision(spec, body, model)
+    if is_physical:
+        add_physical_collision(body, model)
+    else:
+        add_collision(spec, body, model)
 
 
 def _colour(rgb: tuple[int, int, int]) -> tuple[float, float, float, float]:
@@ -114,7 +130,12 @@ def _add_skin(
 
 
 def _add_mesh(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, surface: Surface, rgba: tuple[float, ...]
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    name: str,
+    surface: Surface,
+    rgba: tuple[float, ...],
+    touch: Mapping[str, Any] | None = None,
 ) -> None:
     spec.add_mesh(
         name=f"face/{name}",
@@ -122,11 +143,11 @@ def _add_mesh(
         userface=surface.triangles.ravel().tolist(),
         inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
-    kind = mujoco.mjtGeom.mjGEOM_MESH
-    body.add_geom(name=f"face/{name}", type=kind, meshname=f"face/{name}", rgba=rgba, **_VISUAL)
+    shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": f"face/{name}", "rgba": rgba}
+    body.add_geom(name=f"face/{name}", **shape, **_VISUAL | dict(touch or {}))
 
 
-def _add_eyes(head: mujoco.MjsBody, model: FaceModel) -> None:
+def _add_eyes(head: mujoco.MjsBody, model: FaceModel, touch: Styles) -> None:
     for side in ("left", "right"):
         lids = model.vertices[model.rings[f"eye_{side}"]]
         centre = lids.mean(axis=0) - [_EYE_RADIUS - 0.0022, 0.0, 0.0]
@@ -136,7 +157,8 @@ def _add_eyes(head: mujoco.MjsBody, model: FaceModel) -> None:
             ("pupil", 0.0034, _EYE_RADIUS - 0.0020, (0.03, 0.02, 0.02, 1.0)),
         ):
             name, place = f"face/{part}_{side}", centre + np.array([forward, 0.0, 0.0])
-            head.add_geom(name=name, size=(radius, 0, 0), pos=place, rgba=rgba, **_VISUAL)
+            style = _VISUAL | dict(touch.get(part, {}))
+            head.add_geom(name=name, size=(radius, 0, 0), pos=place, rgba=rgba, **style)
 
 
 def _add_ears(head: mujoco.MjsBody) -> None:
@@ -154,128 +176,19 @@ def _add_ears(head: mujoco.MjsBody) -> None:
 
 
 def _add_mouth_parts(
-    spec: mujoco.MjSpec, head: mujoco.MjsBody, jaw: mujoco.MjsBody, model: FaceModel
+    spec: mujoco.MjSpec,
+    head: mujoco.MjsBody,
+    jaw: mujoco.MjsBody,
+    model: FaceModel,
+    touch: Styles,
 ) -> None:
     lips = model.vertices[model.rings["lips_inner"]].mean(axis=0)
     upper = mesh.teeth(lips + np.array([-0.004, 0.0, 0.008]), -0.009)
     # the lower arch is smaller and bites behind the upper one
     foot = lips + np.array([-0.006, 0.0, -0.011]) - model.hinge
     lower = mesh.teeth(foot, 0.008, 0.019, 0.024)
-    _add_mesh(spec, head, "teeth_upper", upper, _TEETH)
-    _add_mesh(spec, jaw, "teeth_lower", lower, _TEETH)
+    _add_mesh(spec, head, "teeth_upper", upper, _TEETH, touch.get("teeth"))
+    _add_mesh(spec, jaw, "teeth_lower", lower, _TEETH, touch.get("teeth"))
     size, centre = (0.026, 0.017, 0.007), lips + np.array([-0.038, 0.0, -0.009]) - model.hinge
-    red = (0.46, 0.19, 0.20, 1.0)
-    jaw.add_geom(name="face/tongue", type=_ELLIPSOID, size=size, pos=centre, rgba=red, **_VISUAL)
-
-
-# Flesh gives way: a finger of the arm sinks in by a millimetre for every newton or two. The geoms
-# have priority, or the stiff rubber of the finger pads would decide.
-_SOFT = {"priority": 2, "solref": (0.05, 1.0), "solimp": (0.9, 0.9, 0.001, 0.5, 2.0)}
-_HIDDEN = {"mass": 0, "group": 3, "conaffinity": 0, "rgba": (0.9, 0.5, 0.2, 0.4), **_SOFT}
-_OUTSIDE: dict[str, Any] = {**_HIDDEN, "contype": FACE, "friction": (0.3, 0.005, 0.0001)}
-_INSIDE: dict[str, Any] = {**_HIDDEN, "contype": MOUTH, "friction": (1.0, 0.01, 0.0001)}
-
-_LIP_RADIUS: Final = 0.004
-_UPPER_CHAIN: Final = (78, 80, 82, 312, 310, 308)
-_LOWER_CHAIN: Final = (308, 318, 317, 87, 88, 78)
-"""Landmarks of the inner lips that the capsules run between, corner to corner."""
-
-_ELLIPSOIDS: Final = (
-    # body, name, half axes, centre (head: body frame; jaw and torso: from their own origin)
-    ("head", "skull", (0.100, 0.076, 0.092), (-0.055, 0.0, 0.030)),
-    ("head", "cheeks", (0.060, 0.070, 0.036), (-0.015, 0.0, 0.000)),
-    ("head", "nose", (0.020, 0.013, 0.026), (0.052, 0.0, -0.004)),
-    ("jaw", "chin", (0.022, 0.024, 0.012), (0.038, 0.0, -0.072)),
-)
-
-_MOUTH_BOXES: Final = (
-    # name, half sizes, centre in the mouth frame, tilt about y (negative: falls to the back)
-    ("tongue_floor", (0.045, 0.035, 0.006), (-0.030, 0.0, -0.032), -0.07),
-    ("cheek_left", (0.036, 0.006, 0.036), (-0.042, 0.040, 0.0), 0.0),
-    ("cheek_right", (0.036, 0.006, 0.036), (-0.042, -0.040, 0.0), 0.0),
-    ("throat", (0.006, 0.040, 0.036), (-0.082, 0.0, 0.0), 0.0),
-    ("palate", (0.036, 0.035, 0.006), (-0.042, 0.0, 0.040), 0.0),
-)
-
-
-def add_collision(
-    spec: mujoco.MjSpec, body: Mapping[str, mujoco.MjsBody], model: FaceModel
-) -> None:
-    """Add the collision geoms to the bodies ``head``, ``jaw`` and ``torso``, and a mouth's inside.
-
-    The inside of the mouth is a body of its own that a stiff weld drags after ``face/mouth``.
-    Bodies moved by mocap have no velocity in MuJoCo, so that friction on one would hold a cube
-    fast in the world while the mouth moves away from under it.
-    """
-    for owner, name, size, centre in _ELLIPSOIDS:
-        shape = {"type": _ELLIPSOID, "size": size, "pos": centre, **_OUTSIDE}
-        body[owner].add_geom(name=f"face/{name}", **shape)
-    _add_neck_and_bust(body)
-    _add_lips(body, model)
-    cavity = _add_cavity(spec, body["mouth"])
-    for name, size, centre, tilt in _MOUTH_BOXES:
-        quat = (np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0)
-        cavity.add_geom(name=f"face/{name}", type=_BOX, size=size, pos=centre, quat=quat, **_INSIDE)
-
-
-def _add_cavity(spec: mujoco.MjSpec, mouth: mujoco.MjsBody) -> mujoco.MjsBody:
-    """The body ``face/cavity``, welded to the mocap body ``mouth``."""
-    cavity = spec.worldbody.add_body(
-        name="face/cavity",
-        pos=mouth.pos.tolist(),
-        quat=mouth.quat.tolist(),
-        gravcomp=1.0,
-        mass=0.5,  # kg and kg m²: ten times the cube's, so that the cube does not move the mouth
-        inertia=(5e-4,) * 3,
-        explicitinertial=True,
-    )
-    cavity.add_freejoint(name="face/cavity")
-    weld = spec.add_equality(
-        name="face/cavity",
-        type=mujoco.mjtEq.mjEQ_WELD,
-        objtype=mujoco.mjtObj.mjOBJ_BODY,
-        name1=mouth.name,
-        name2=cavity.name,
-        solref=(
-            0.004,
-            1.0,
-        ),  # time constant, s: twice the physics step, the stiffest that is stable
-    )
-    # anchor, relative position and orientation, torque scale (explicit: its default has changed)
-    weld.data[:11] = (0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1)
-    return cavity
-
-
-def _add_neck_and_bust(body: Mapping[str, mujoco.MjsBody]) -> None:
-    _add_capsule(body["head"], "neck", 0.052, (-0.055, 0, -0.03, -0.060, 0, -0.12))
-    shoulders = (-0.134, -0.125, -0.240, -0.134, 0.125, -0.240)
-    _add_capsule(body["torso"], "shoulders", 0.085, shoulders)
-    size, centre = (0.095, 0.195, 0.11), (-0.136, 0, -0.34)
-    body["torso"].add_geom(name="face/chest", type=_BOX, size=size, pos=centre, **_OUTSIDE)
-
-
-def _add_capsule(body: mujoco.MjsBody, name: str, radius: float, ends: Sequence[float]) -> None:
-    kind, size = mujoco.mjtGeom.mjGEOM_CAPSULE, (radius, 0, 0)
-    body.add_geom(name=f"face/{name}", type=kind, size=size, fromto=ends, **_OUTSIDE)
-
-
-def _add_lips(body: Mapping[str, mujoco.MjsBody], model: FaceModel) -> None:
-    """Ten capsules inside the lips, upper ones on the head, lower ones on the jaw.
-
-    They lie where the lips are at `REST_OPENING`, midway between inner and outer edge, so that
-    they leave the opening itself free.
-    """
-    angle = model.jaw_angle(REST_OPENING)
-    at = model.deform(angle)
-    back = hinge_quaternion(angle) * [1, -1, -1, -1]
-    rings = model.rings
-    outer = dict(zip(rings["lips_inner"].tolist(), rings["lips_outer"].tolist(), strict=True))
-    count = 0
-    for owner, chain in (("head", _UPPER_CHAIN), ("jaw", _LOWER_CHAIN)):
-        inner = np.array(chain)
-        line = 0.5 * (at[inner] + at[[outer[i] for i in chain]]) - [_LIP_RADIUS, 0.0, 0.0]
-        if owner == "jaw":
-            line = rotate(back, line - model.hinge)
-        for start, end in pairwise(line.tolist()):
-            _add_capsule(body[owner], f"lip_{count}", _LIP_RADIUS, [*start, *end])
-            count += 1
+    shape = {"type": _ELLIPSOID, "size": size, "pos": centre, "rgba": (0.46, 0.19, 0.20, 1.0)}
+    jaw.add_geom(name="face/tongue", **shape, **_VISUAL | dict(touch.get("tongue", {})))

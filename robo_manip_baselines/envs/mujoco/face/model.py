@@ -123,6 +123,11 @@ class FaceModel:
         distance, angle = self._openings
         return np.asarray(np.interp(np.clip(jaw, 0.0, MAX_OPENING), distance, angle))
 
+    def jaw_at(self, angle: ArrayLike) -> Floats:
+        """Distance (...) m between the inner lips at jaw angles (...) rad: `jaw_angle` undone."""
+        distance, table = self._openings
+        return np.asarray(np.interp(angle, table, distance))
+
     @cached_property
     def _openings(self) -> tuple[Floats, Floats]:
         """A table of lip distance (m, increasing) against hinge angle (rad)."""
@@ -138,10 +143,15 @@ class FaceModel:
 
     def lip_centre(self, angle: ArrayLike) -> Floats:
         """Mean of the 40 lip vertices (..., 3) m at jaw angles (...) rad."""
+        still, arm = self.lip_lever
+        return still + rotate(hinge_quaternion(np.asarray(angle, float)), arm)
+
+    @cached_property
+    def lip_lever(self) -> tuple[Floats, Floats]:
+        """(3,) m each: parts of the lips' centre that stay and that turn with the jaw."""
         vertices, weight = self.vertices[self.lips], self.jaw_weight[self.lips][:, None]
         still = ((1 - weight) * vertices + weight * self.hinge).mean(axis=0)
-        arm = (weight * (vertices - self.hinge)).mean(axis=0)
-        return still + rotate(hinge_quaternion(np.asarray(angle, float)), arm)
+        return still, (weight * (vertices - self.hinge)).mean(axis=0)
 
     def body_poses(self, mouth: ArrayLike, orientation: ArrayLike, jaw: ArrayLike) -> Poses:
         """Poses of the mocap bodies that put the centre of the lips at ``mouth``.

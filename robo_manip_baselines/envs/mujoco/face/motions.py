@@ -159,6 +159,11 @@ class FaceMotion:
         return next((part for part in self.parts if isinstance(part, Recorded)), None)
 
     @property
+    def refuses(self) -> bool:
+        """True if the head turns away to refuse, now and then."""
+        return any(isinstance(part, TurnAway) for part in self.parts)
+
+    @property
     def is_as_recorded(self) -> bool:
         """True for a recorded motion unchanged, to which a predictor's forecasts apply."""
         return self.parts == (Recorded(),)

@@ -34,12 +34,14 @@ class FaceReplay:
             forecast it; None if the recorded motion came without. Exact at video frames;
             between them the predictor's last error is held.
         jaw: (T,) m between the inner lips.
+        jaw_angle: (P,) rad, of the jaw about its hinge.
         opening: (T, 2) m, half width and half height of the mouth's opening.
     """
 
     bodies: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     mouth: NDArray[np.float64]
     jaw: NDArray[np.float64]
+    jaw_angle: NDArray[np.float64]
     opening: NDArray[np.float64]
     predicted: NDArray[np.float64] | None = None
 
@@ -74,6 +76,7 @@ class FaceReplay:
             bodies=face.body_poses(start_position + displacement, orientation, jaw),
             mouth=start_position + ahead,
             jaw=jaw[::substeps],
+            jaw_angle=face.jaw_angle(jaw),
             opening=np.stack(face.opening(jaw[::substeps]), axis=-1),
             predicted=predicted,
         )

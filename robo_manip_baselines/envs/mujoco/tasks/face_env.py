@@ -17,7 +17,8 @@ from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, CameraRenderer
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
-from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
+from robo_manip_baselines.envs.mujoco.face import FACES, REST_OPENING, FaceModel, add_face
+from robo_manip_baselines.envs.mujoco.face.contact import FaceTouch
 from robo_manip_baselines.envs.mujoco.face.forecasters import (
     MotionForecasters,
     require_no_waiting,
@@ -30,6 +31,8 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
 )
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
+from robo_manip_baselines.envs.mujoco.face.physical import CompliantHead
+from robo_manip_baselines.envs.mujoco.face.proximity import FaceProximity
 from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FRAMES_AHEAD, FaceReplay
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry
 from robo_manip_baselines.observation import (
@@ -54,6 +57,10 @@ FACE_OFFSET = 0.05
 PARKED_QPOS = (0.0, -1.8, 1.55, 0.0, -1.2, 0.0)
 """rad, the left arm folded back over its base, out of the head's way."""
 
+REFUSAL_ANGLE = np.radians(20.0)
+"""rad by which the face has turned from world +x where it refuses: more than people who talk turn
+for long, and less than `TurnAway` does."""
+
 RENDER_CAMERA = "angle"
 """Camera of ``render()``."""
 
@@ -68,13 +75,25 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     A task derives from it and implements the methods of the section "task": its objects, their
     start, and after each step the reward, the end and ``info``; ``docs/add-an-environment.md``
     makes one. The ``info`` of every task holds ``is_success`` and ``is_success_strict`` (bool),
-    ``completion_time`` (s, None before success) and ``phase`` (one of ``phase_names``).
+    ``completion_time`` (s, None before success) and ``phase`` (one of ``phase_names``). `step` and
+    `reset` add, for every task:
+
+    | key | type | content |
+    |---|---|---|
+    | ``face_contacts`` | tuple of `FaceContact` | what touched which region of the face in the
+    step, how hard (N), with which impulse (N s) and where; empty where nothing did |
+    | ``face_proximity`` | `Proximity` or None | distances of the robot, and of what it carries,
+    from face and eyes (m), grippers and mouth; None unless ``measures_proximity`` |
+    | ``is_refusing`` | bool or None | the head is turned away; None where the motion has no
+    ``turn_away`` |
 
     Args:
         obs, horizon, cameras, image_size, object_pose, arms, relative: see `ObservationSpec`.
         render_size: height and width at which cameras are drawn, before `fit_image` makes the
             images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
+        face: kind of face: ``visual``, which follows the recorded motion whatever touches it, or
+            ``physical``, soft tissue on a head that yields, see ``docs/face_model.md``.
         face_motion: start of the motion: ``episode`` or ``after_lift``.
         motion: of the face by name, as `parse_motion` reads it: ``recorded``, ``sway``, ...
         people: who moves: ``all``, or ``train`` or ``test`` for demonstrations and evaluation with
@@ -93,6 +112,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         observation_spec: what is observed.
         renders_images: whether observations include images; rollouts clear it for steps whose
             images no policy reads.
+        measures_proximity: whether ``info`` has distances from the face, which take a tenth of a
+            millisecond a step; evaluations set it.
         vector: (S,) float32, all vectors of the last observation, packed.
 
     Raises:
@@ -118,6 +139,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         relative: bool = False,
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
+        face: str = "visual",
         face_motion: str = "episode",
         motion: str | Mapping[str, Any] | Sequence[Any] = "recorded",
         people: str = "all",
@@ -143,10 +165,13 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             arms=arms,
             corruption=_make_corruption(corruption),
         )
+        self.task.require_arms(spec.arms)
         _check_drawing(shadows, multisamples)
         if object_pose and not self.task.names.objects:
             raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")
         self.renders_images = True
+        self.measures_proximity = False
+        self.face_kind = require_choice("face", face, FACES)
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
         self.motion = parse_motion(motion)
         self.people = require_choice("people", people, PEOPLE)
@@ -180,7 +205,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             require_choice("clip", clip, set(self.library.part(self.people).run_clip))
         self.face = FaceModel.load()
         scene = build_cell()
-        add_face(scene)
+        add_face(scene, self.face_kind)
         self.add_objects(scene)
         self.model: mujoco.MjModel = scene.compile()
         self.xml_hash = hashlib.sha256(scene.to_xml().encode()).hexdigest()
@@ -243,12 +268,17 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self._actuators = np.array([model.actuator(servo).id for servo in servos])
         self._gripper_site = model.site("right/gripper").id
         self._mouth_site = model.site("mouth").id
-        self._face_geoms = frozenset(np.flatnonzero(model.geom_contype == FACE).tolist())
+        outside = (model.geom_contype & FACE) != 0
+        self._face_geoms = frozenset(np.flatnonzero(outside).tolist())
         self._mocap = {
             model.body(body).name: int(model.body_mocapid[body])
             for body in range(model.nbody)
             if model.body_mocapid[body] >= 0
         }
+        self.touch = FaceTouch(model, self.task.names.objects)
+        self._proximity = FaceProximity(model, self.task.names.objects)
+        is_physical = self.face_kind == "physical"
+        self._compliant_head = CompliantHead(model, self.face) if is_physical else None
 
     # -- Gymnasium ------------------------------------------------------------------------------
 
@@ -289,13 +319,20 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             timestep=self.model.opt.timestep,
             substeps=self.substeps,
         )
+        # Of a physical face, the head moves by forces, and the mouth with it.
+        placed = ("face/torso",) if self._compliant_head else self.replay.bodies
+        self._placed = {body: self.replay.bodies[body] for body in placed}
         self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
         self.reset_task(self.np_random)
         self._place_face(0)
-        position, orientation = self.replay.bodies["face/mouth"]
-        self.data.joint("face/cavity").qpos = (*position[0], *orientation[0])
+        if self._compliant_head is None:
+            position, orientation = self.replay.bodies["face/mouth"]
+            self.data.joint("face/cavity").qpos = (*position[0], *orientation[0])
+        else:
+            self._compliant_head.reset(self.data, self.replay)
         mujoco.mj_forward(self.model, self.data)
+        self.touch.clear()
         if self._pipeline:
             # Last, so that the world is the same as without corruption.
             drawn = int(self.np_random.integers(2**32)) if seed is None else seed
@@ -306,7 +343,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 )
         self._stage = "reset"
         self._show()
-        return self.observe(), self.info()
+        return self.observe(), {**self.info(), **self._safety_info()}
 
     def step(
         self, action: NDArray[np.float32]
@@ -322,7 +359,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.simulate(action)
         reward, terminated = self.advance()
         self._show()
-        return self.observe(), reward, terminated, False, self.info()
+        info = {**self.info(), **self._safety_info()}
+        return self.observe(), reward, terminated, False, info
 
     def simulate(self, action: NDArray[Any]) -> None:
         """Apply an action for one control period, the face moving at every physics step.
@@ -333,11 +371,15 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         action = self._checked_action(action)
         low, high = self.model.actuator_ctrlrange[self._actuators].T
         self.data.ctrl[self._actuators] = np.clip(action, low, high)
+        self.touch.clear()
         for substep in range(self.substeps):
             self._place_face(substep + 1)
             mujoco.mj_step(self.model, self.data)
+            self.touch.read(self.model, self.data)
             self.watch_contacts()
         self.step_count += 1
+        if self._compliant_head:
+            self._compliant_head.place_mouth(self.data)
         # After a step, sites and cameras are still where they were before its integration.
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
@@ -438,8 +480,15 @@ class FaceEnv(gymnasium.Env[Any, Any]):
 
     @property
     def mouth_track(self) -> Floats:
-        """(K, 3) m, world: the true mouth now and 1 ... 24 frames ahead."""
-        return self.replay.mouth[self._row()].copy()
+        """(K, 3) m, world: the true mouth now and 1 ... 24 frames ahead.
+
+        Of a physical face, the mouth where it is now, and where it will be if nothing touches it:
+        the recorded motion.
+        """
+        track = self.replay.mouth[self._row()].copy()
+        if self._compliant_head:
+            track[0] = self.data.site_xpos[self._mouth_site]
+        return track
 
     @property
     def predicted_mouth(self) -> Floats | None:
@@ -453,7 +502,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     def mouth_at(self, time: ArrayLike) -> Floats:
         """(..., 3) m, world: the true mouth at ``time`` (...) s of the episode, past or future.
 
-        A motion that waits for its start is taken to go on waiting.
+        A motion that waits for its start is taken to go on waiting. Of a physical face, it is the
+        mouth of the recorded motion, which nothing has touched.
         """
         start = np.inf if self.motion_start is None else self.motion_start * CONTROL_PERIOD
         moving = np.clip(np.asarray(time, dtype=np.float64) - start, 0.0, SEGMENT_DURATION)
@@ -469,30 +519,41 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         mouth, jaw = MOUTH_BASE + self.face_offset + displacement, jaw + REST_OPENING
         head, turn = self.face.body_poses(mouth, orientation, jaw)["face/head"]
         point = self.face.deform(self.face.jaw_angle(jaw), [landmark])[:, 0]
-        return head + rotate(turn, point)
+        track = head + rotate(turn, point)
+        if self._compliant_head:  # now, as in `mouth_track`
+            angle = self._compliant_head.jaw_angle(self.data)
+            (here,) = self.face.deform(angle, [landmark])
+            track[0] = self._compliant_head.point(self.data, here)
+        return track
 
     def max_face_force(self) -> float:
         """Return the largest normal force between the robot and the face now, N.
 
-        For `watch_contacts`: a control step has several physics steps.
+        For `watch_contacts`: a control step has several physics steps. The robot has tools, too,
+        that the outside of a face stops; food does not count.
         """
-        force, wrench = 0.0, None
-        for contact, pair in enumerate(self.data.contact.geom.tolist()):
-            if not self._face_geoms.isdisjoint(pair):
-                wrench = np.zeros(6) if wrench is None else wrench
-                mujoco.mj_contactForce(self.model, self.data, contact, wrench)
-                force = max(force, float(wrench[0]))
-        return force
+        return self.touch.robot_force
 
     @property
     def jaw_opening(self) -> float:
         """m between the inner lips."""
+        if self._compliant_head:
+            return float(self.face.jaw_at(self._compliant_head.jaw_angle(self.data)))
         return float(self.replay.jaw[self._row()])
 
     @property
     def mouth_opening(self) -> Floats:
         """(2,) m: half width and half height of the opening between the inner lips."""
+        if self._compliant_head:
+            return np.array(self.face.opening(self.jaw_opening))
         return self.replay.opening[self._row()]
+
+    @property
+    def head_orientation(self) -> Floats:
+        """(4,) wxyz, world from head; identity for an upright face that looks along world +x."""
+        if self._compliant_head:
+            return self._compliant_head.orientation(self.data)
+        return self.data.mocap_quat[self._mocap["face/head"]].copy()
 
     def state(self) -> State:
         """Return the state before corruption."""
@@ -539,14 +600,17 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             "end_effector_orientation": self.gripper_orientation,
             "mouth_position": self.mouth_track,
             **({} if predicted is None else {"predicted_mouth": predicted}),
-            # World from head; identity for an upright face that looks along world +x.
-            "head_orientation": self.data.mocap_quat[self._mocap["face/head"]].copy(),
+            "head_orientation": self.head_orientation,
             "jaw_opening": self.jaw_opening,
             "phase": np.int8(self.phase_names.index(self.info()["phase"])),
             "qpos": self.data.qpos.copy(),
             "qvel": self.data.qvel.copy(),
             **self.task_row(),
         }
+
+    def contact_row(self) -> dict[str, Any]:
+        """Return the fields of an episode file's row that are known after its action."""
+        return self.touch.row()
 
     def start_attributes(self) -> dict[str, Any]:
         """Return the attributes of an episode file that are known after its reset.
@@ -580,9 +644,29 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         moving = 0 if self.motion_start is None else substep
         last = (len(self.replay.jaw) - 1) * self.substeps
         row = min(self._motion_step() * self.substeps + moving, last)
-        for body, (position, orientation) in self.replay.bodies.items():
+        head = self._compliant_head
+        if head and substep:
+            head.drive(self.data, row)
+            head.place_mouth(self.data)
+        for body, (position, orientation) in self._placed.items():
             self.data.mocap_pos[self._mocap[body]] = position[row]
             self.data.mocap_quat[self._mocap[body]] = orientation[row]
+
+    def _safety_info(self) -> dict[str, Any]:
+        near = None
+        if self.measures_proximity:
+            near = self._proximity.measure(self.model, self.data, self.touch.pairs)
+        return {
+            "face_contacts": self.touch.contacts,
+            "face_proximity": near,
+            "is_refusing": self._is_refusing(),
+        }
+
+    def _is_refusing(self) -> bool | None:
+        """Whether a head that refuses now and then is turned away; None where it never does."""
+        if not self.motion.refuses:
+            return None
+        return bool(facing_angle(self.head_orientation) > REFUSAL_ANGLE)
 
     def _set_arm(self, arm: str, joints: Sequence[float], finger: float) -> None:
         for joint, angle in zip(ARM_JOINTS, joints, strict=True):
@@ -592,6 +676,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         sign = np.sign(self.model.joint(f"{arm}/right_finger").range.sum())
         self.data.joint(f"{arm}/right_finger").qpos = sign * finger
         self.data.actuator(f"{arm}/gripper").ctrl = finger
+
+
+def facing_angle(orientation: ArrayLike) -> Floats:
+    """Return the angle (...) rad between the face's normal and world +x, given (..., 4) wxyz."""
+    w, x, y, z = np.moveaxis(np.asarray(orientation, dtype=np.float64), -1, 0)
+    return np.arccos(np.clip(w**2 + x**2 - y**2 - z**2, -1.0, 1.0))
 
 
 def world_of(env: gymnasium.Env[Any, Any]) -> FaceEnv:

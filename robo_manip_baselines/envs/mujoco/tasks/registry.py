@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.observation import Corruption, ObservedNames
+from robo_manip_baselines.observation.spec import ARMS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 NAMESPACE = "robo_manip_baselines"
@@ -26,6 +27,7 @@ NAMESPACE = "robo_manip_baselines"
 TASKS = {
     "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
     "DrinkingEnv": "robo_manip_baselines.envs.mujoco.tasks.drinking:ENTRY",
+    "BimanualFeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.bimanual_feeding:ENTRY",
 }
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
 
@@ -215,6 +217,7 @@ class TaskEntry:
             one is the default.
         metrics: ``module:class`` of its `EpisodeMetrics`.
         failures: kind of failure -> description.
+        arms: that can do it, of `ObservationSpec.arms`; the first is the default.
         names: of target and objects in observations.
         target_field, predicted_field: fields of an episode that hold the true target and a
             predictor's output for it; ``predicted_field`` is empty where the target is not the
@@ -237,6 +240,7 @@ class TaskEntry:
     metrics: str
     failures: Mapping[str, str]
     version: int = 0
+    arms: tuple[str, ...] = tuple(ARMS)
     names: ObservedNames = field(default_factory=ObservedNames)
     target_field: str = "mouth_position"
     predicted_field: str = "predicted_mouth"
@@ -259,6 +263,17 @@ class TaskEntry:
     def env_id(self) -> str:
         """Registered id of the environment."""
         return f"{NAMESPACE}/{self.name}-v{self.version}"
+
+    def require_arms(self, arms: str) -> None:
+        """Require arms that can do the task.
+
+        Raises:
+            RequestError: they cannot.
+        """
+        if arms not in self.arms:
+            raise RequestError(
+                f"arms {arms}: cannot do {self.name}; valid: {', '.join(sorted(self.arms))}"
+            )
 
     def make_expert(self, name: str, env: Any) -> Expert:
         """Make a scripted expert for an unwrapped environment.
@@ -361,6 +376,7 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "relative": (bool,),
     "arms": (str,),
     "corruption": (dict, type(None)),
+    "face": (str,),
     "face_motion": (str,),
     "motion": (str,),
     "people": (str,),
@@ -464,6 +480,27 @@ FACE_FIELDS = (
         "Distance between the middle of the inner lips, now",
         "m",
         rule="not negative",
+    ),
+    Field(
+        "region_force",
+        ("T", "R", "B"),
+        "Largest normal force between a region of the face and what touches it, in the control "
+        "step of this row's action, all contact points together",
+        "N",
+        dtype="float32",
+        rule="not negative",
+        since=4,
+        is_optional=True,
+    ),
+    Field(
+        "region_impulse",
+        ("T", "R", "B"),
+        "Impulse of the normal force, likewise",
+        "N s",
+        dtype="float32",
+        rule="not negative",
+        since=4,
+        is_optional=True,
     ),
 )
 """Fields that every task with a replayed face records."""

@@ -28,6 +28,10 @@ OFF_TABLE = -0.05
 """m, height of the cube's centre below which it has fallen off the table."""
 
 
+_FINGER_BITS = {"right": (1, 2), "left": (4, 8)}
+"""Bits of the left and the right finger of each arm."""
+
+
 class FeedingEnv(FaceEnv):
     """Pick up a red cube and bring it to the mouth of a head that moves as a person moved.
 
@@ -108,6 +112,8 @@ class FeedingEnv(FaceEnv):
     | ``face_force`` | float | N, the largest normal force between the robot and the face in the
     step |
 
+    and what `FaceEnv` adds for every task.
+
     ## Episode end
 
     Terminates when the cube was delivered (``is_success``) and let go and the gripper has
@@ -129,6 +135,8 @@ class FeedingEnv(FaceEnv):
     ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
     3}``; None shows the truth |
     | ``arms`` | ``"right"`` | right or both |
+    | ``face`` | ``"visual"`` | kind of face: visual, or physical, soft tissue on a head that
+    yields |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
@@ -158,20 +166,23 @@ class FeedingEnv(FaceEnv):
         self._cube_qpos = int(model.joint("cube").qposadr[0])
         self._cube_body = model.body("cube").id
         self._cube_geom = model.geom("cube").id
-        links = [model.body(f"right/{side}_finger_link").id for side in ("left", "right")]
-        # For each geom: bit 0 where it is of the left finger, bit 1 of the right.
-        self._finger_bits = ((model.geom_bodyid == np.array(links)[:, None]).T @ [1, 2]).tolist()
+        # For each geom: bits 0 and 1 where it is of a finger of the right arm, 2 and 3 of the left.
+        self._finger_bits = [_finger_bits(model, geom) for geom in range(model.ngeom)]
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Add the red cube."""
         add_cube(scene)
 
     def reset_task(self, rng: np.random.Generator) -> None:
-        """Put the cube somewhere on the table in front of the head."""
+        """Put the cube where `draw_cube` says, flat on the table."""
         self.progress = FeedingProgress()
         self._clear_contacts()
-        x, y = rng.uniform(CUBE_LOW, CUBE_HIGH)
+        x, y = self.draw_cube(rng)
         self.data.qpos[self._cube_qpos : self._cube_qpos + 7] = (x, y, CUBE_SIZE / 2, 1, 0, 0, 0)
+
+    def draw_cube(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draw where the cube starts, (2,) m, world x and y."""
+        return rng.uniform(CUBE_LOW, CUBE_HIGH)
 
     def object_position(self) -> NDArray[np.float64]:
         """(1, 3) m, world: centre of the cube."""
@@ -239,7 +250,7 @@ class FeedingEnv(FaceEnv):
 
     def watch_contacts(self) -> None:
         """Record which fingers touch the cube, and how hard the robot touches the face."""
-        for first, second in self.data.contact.geom.tolist():
+        for first, second in self.touch.pairs:
             if self._cube_geom in (first, second):
                 self._fingers_on_cube |= self._finger_bits[first] | self._finger_bits[second]
         self._face_force = max(self._face_force, self.max_face_force())
@@ -248,16 +259,28 @@ class FeedingEnv(FaceEnv):
         self._fingers_on_cube = 0
         self._face_force = 0.0
 
+    def _fingers_on(self, arm: str) -> int:
+        """Return how many fingers of an arm touched the cube in the last step."""
+        return sum(bool(self._fingers_on_cube & bit) for bit in _FINGER_BITS[arm])
+
     def _measure(self) -> StepMeasurements:
         mouth, gripper = self.mouth_track[0], self.gripper_position
         half_width, half_height = self.mouth_opening.tolist()
         return StepMeasurements(
             time=self.time,
-            is_held=self._fingers_on_cube == 0b11,
-            is_touched=self._fingers_on_cube != 0,
+            is_held=self._fingers_on("right") == 2,
+            is_touched=self._fingers_on("right") > 0,
             cube_height=float(self.cube_position[2]),
             is_at_mouth=is_at_mouth(gripper, mouth),
             is_inside_mouth=is_inside_mouth(self.cube_offset, half_width, half_height),
             touches_face=self._face_force > 0.0,
             gripper_distance=float(np.linalg.norm(gripper - mouth)),
         )
+
+
+def _finger_bits(model: mujoco.MjModel, geom: int) -> int:
+    """Return the bit of the finger that a geom belongs to; 0 if it is of none."""
+    body = model.body(int(model.geom_bodyid[geom])).name
+    arm, _, link = body.partition("/")
+    fingers = ("left_finger_link", "right_finger_link")
+    return _FINGER_BITS[arm][fingers.index(link)] if link in fingers else 0

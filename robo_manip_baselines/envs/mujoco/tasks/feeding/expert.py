@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import mink
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +32,7 @@ from robo_manip_baselines.envs.mujoco.expert.servo import (
     ServoConfig,
     first_of,
 )
+from robo_manip_baselines.envs.mujoco.tasks.feeding import APPROACH_LIMIT
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import is_at_mouth
 from robo_manip_baselines.observation import FRAME_PERIOD
@@ -86,27 +88,37 @@ def servo(env: FeedingEnv) -> FeedingServo:
     return FeedingServo(env)
 
 
-def fetch(place: Callable[[ExpertView], NDArray[np.float64]]) -> list[ExpertPhase]:
-    """Return the phases that take the cube and bring it, level, to a place (3,) m."""
+def pick_up(orientation: mink.SO3 = DOWN, depth: float = GRASP_OFFSET) -> list[ExpertPhase]:
+    """Return the phases that take the cube from the table and lift it.
+
+    Args:
+        orientation: world from gripper, which points down.
+        depth: m from the gripper site down to the cube's centre.
+    """
 
     def over_object(view: ExpertView, height: float) -> Command:
         position = view.object_position + np.array([0.0, 0.0, height])
-        return Command(position, DOWN, FINGER_OPEN)
+        return Command(position, orientation, FINGER_OPEN)
 
     def lifted(view: ExpertView, last: Command) -> Command:
         return replace(last, position=last.position + np.array([0.0, 0.0, LIFT]))
+
+    return [
+        Reach(lambda view, last: over_object(view, depth + CLEARANCE)),
+        Reach(lambda view, last: over_object(view, depth), speed=0.15),
+        Grip(FINGER_CLOSED, 0.4),
+        Reach(lifted, speed=0.2),
+    ]
+
+
+def bring(place: Callable[[ExpertView], NDArray[np.float64]]) -> Reach:
+    """Return the phase that brings the gripper, level, to a place (3,) m."""
 
     def brought(view: ExpertView, last: Command) -> Command:
         position = place(view)
         return Command(position, level_at(position), last.finger)
 
-    return [
-        Reach(lambda view, last: over_object(view, GRASP_OFFSET + CLEARANCE)),
-        Reach(lambda view, last: over_object(view, GRASP_OFFSET), speed=0.15),
-        Grip(FINGER_CLOSED, 0.4),
-        Reach(lifted, speed=0.2),
-        Reach(brought, least_duration=1.2),
-    ]
+    return Reach(brought, least_duration=1.2)
 
 
 class FeedingExpert(PhasedExpert):
@@ -115,11 +127,14 @@ class FeedingExpert(PhasedExpert):
     Args:
         env: the environment, unwrapped.
         lead: s; it aims where the mouth will be this much later.
+        limit: s since the approach may begin, after which it should be at the mouth.
     """
 
-    def __init__(self, env: FeedingEnv, lead: float = 0.0) -> None:
+    def __init__(
+        self, env: FeedingEnv, lead: float = 0.0, *, limit: float = APPROACH_LIMIT
+    ) -> None:
         super().__init__()
-        self._env, self._lead = env, lead
+        self._env, self._lead, self._limit = env, lead, limit
 
     def view(self) -> ExpertView:
         """Return the present state."""
@@ -135,15 +150,18 @@ class FeedingExpert(PhasedExpert):
 
     def phases(self, home: Command) -> list[ExpertPhase]:
         """Return the phases of one episode, in order."""
+        # Phase 1: approach and grasp the cube.
+        return [*pick_up(), bring(self.standoff), *self.delivery(home)]
 
-        def standoff(view: ExpertView) -> NDArray[np.float64]:
-            return view.target() + STANDOFF
+    def standoff(self, view: ExpertView) -> NDArray[np.float64]:
+        """Return where the approach to the mouth starts, (3,) m, world."""
+        return view.target() + STANDOFF
 
+    def delivery(self, home: Command) -> list[ExpertPhase]:
+        """Return the phases from there on: to the mouth, let go, and home."""
         return [
-            # Phase 1: approach and grasp the cube.
-            *fetch(standoff),
             # Phase 2: move towards the mouth.
-            Approach(lead=self._lead),
+            Approach(limit=self._limit, lead=self._lead),
             # Phase 3: insert the cube into the mouth, let go, retract.
             Follow(INSERTION, 0.4, lead=self._lead),
             Follow(INSERTION, 0.3, finger=FINGER_OPEN, lead=self._lead),
@@ -192,14 +210,17 @@ class FeedingServo(FeedingExpert):
         other.skip_to(number)
         return other
 
-    def phases(self, home: Command) -> list[ExpertPhase]:
-        """Return the phases of one episode, in order."""
+    def standoff(self, view: ExpertView) -> NDArray[np.float64]:
+        """Return where the approach to the mouth starts, (3,) m, world."""
+        return self._seen(view) + STANDOFF
+
+    def delivery(self, home: Command) -> list[ExpertPhase]:
+        """Return the phases from there on: to the mouth, let go, and home."""
         forecast, config = self._forecast, self._config
         inside, out = float(INSERTION[0]), float(WITHDRAWAL[0])
         coming: Any = {"goal": inside, "rate": INSERTION_SPEED, "execution": self._execution}
         going: Any = {"goal": out, "rate": WITHDRAWAL_SPEED, "execution": self._execution}
         return [
-            *fetch(lambda view: self._seen(view) + STANDOFF),
             Insert(forecast, config, **coming, waiting=WAITING),
             Hold(forecast, config, **coming, duration=0.3, finger=FINGER_OPEN),
             Hold(forecast, config, **going, duration=0.5),

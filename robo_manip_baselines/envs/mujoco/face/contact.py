@@ -1,0 +1,234 @@
+"""Contacts of the face: region by region, how hard it was touched, and by what.
+
+A *region* is a part of the face, whatever geoms it has; a *toucher* is a part of the robot or an
+object of the task. Normal forces count, of all contact points of a region with one toucher
+together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+
+from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, FACE
+
+REGIONS: Final = (
+    "forehead",
+    "eyes",
+    "nose",
+    "cheeks",
+    "lips",
+    "chin",
+    "tongue",
+    "teeth",
+    "mouth",
+    "head",
+    "neck",
+)
+"""``mouth``: its other walls inside; ``head``: the sides and the back; ``neck``: with the bust."""
+
+_EATING: Final = ("lips", "tongue", "teeth", "mouth")
+"""Regions that food touches when it is eaten."""
+
+GRIPPER, ARM, OTHER = "gripper", "arm", "other"
+ROBOT_PARTS: Final = (GRIPPER, ARM, OTHER)
+"""Touchers of every task, before the objects of its own; ``other``: anything else."""
+
+_REGION_OF: Final = {
+    "skull": "head",
+    "cheek_skin": "cheeks",
+    "cheeks": "cheeks",
+    "eye": "eyes",
+    "lip": "lips",
+    "shoulders": "neck",
+    "chest": "neck",
+    "tongue_floor": "tongue",
+    "teeth_upper": "teeth",
+    "teeth_lower": "teeth",
+    "cheek_left": "mouth",
+    "cheek_right": "mouth",
+    "throat": "mouth",
+    "palate": "mouth",
+}
+"""Name of a geom, or its beginning, without ``face/`` -> region, where it is another word."""
+
+EYE_REACH: Final = 0.016
+"""m from an eye's centre within which skull, cheeks and nose count as the eye: the eyeball's 12 mm
+and the lids."""
+
+_BROWS: Final = 0.046
+"""m, body frame: height of the eyebrows, above which the front of the skull is the forehead."""
+
+
+_BRIDGE: Final = 0.012
+"""m from the middle of the face to the sides of the nose's bridge."""
+
+_WALL: Final = 0.040
+"""m from the middle of the face: the walls of the mouth, inside and outside."""
+
+
+class FaceContact(NamedTuple):
+    """Contact of one region with one toucher during a control step.
+
+    Attributes:
+        region: one of `REGIONS`.
+        toucher: one of `ROBOT_PARTS` or an object of the task.
+        is_food: the toucher is something that the outside of a visual face does not stop, at the
+            lips or in the mouth: a mouth takes it in.
+        force: N, the largest of the physics steps, all contact points together.
+        impulse: N s.
+        point: (x, y, z) m, frame of ``face/head`` (out of the face, the person's left, up): the
+            hardest contact point at that moment.
+    """
+
+    region: str
+    toucher: str
+    is_food: bool
+    force: float
+    impulse: float
+    point: tuple[float, float, float]
+
+
+class FaceTouch:
+    """Contacts of the face during a control step.
+
+    Args:
+        model: compiled.
+        objects: names of the task's objects, with which the names of their bodies begin.
+
+    Attributes:
+        touchers: `ROBOT_PARTS` and the objects.
+        pairs: the two geoms of every contact of the last physics step; -1 for a flexible one.
+        robot_force: N, the largest of one contact point between the face and the robot, or a tool
+            that the outside of a face stops, in the last physics step.
+    """
+
+    def __init__(self, model: mujoco.MjModel, objects: Sequence[str]) -> None:
+        self.touchers = (*ROBOT_PARTS, *objects)
+        self._head = model.body("face/head").id
+        self._dt = float(model.opt.timestep)
+        names = [model.geom(geom).name for geom in range(model.ngeom)]
+        touchable = (model.geom_contype | model.geom_conaffinity) != 0
+        # One more than there are geoms: number -1 is no face.
+        self._is_face = [
+            bool(touchable[geom]) and name.startswith("face/") for geom, name in enumerate(names)
+        ] + [False]
+        self._regions = [
+            region_of(name) if is_face else ""
+            for name, is_face in zip(names, self._is_face, strict=False)
+        ]
+        self._toucher = [toucher_of(model, geom, objects) for geom in range(model.ngeom)] + [OTHER]
+        outside = (model.geom_contype & FACE) != 0
+        self._is_stopped = [*((model.geom_conaffinity & FACE) != 0).tolist(), False]
+        self._is_outside = [*(outside & np.array(self._is_face[:-1])).tolist(), False]
+        self._eyes = np.array([model.geom(f"face/eye_{side}").pos for side in ("left", "right")])
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin a control step."""
+        self.pairs: list[list[int]] = []
+        self.robot_force = 0.0
+        self._found: dict[tuple[str, str, bool], FaceContact] = {}
+
+    def read(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Take in the contacts of a physics step."""
+        self.pairs = pairs = data.contact.geom.tolist()
+        self.robot_force = 0.0
+        is_face = self._is_face
+        touching = [n for n, (a, b) in enumerate(pairs) if is_face[a] or is_face[b]]
+        if touching:
+            self._measure(model, data, touching)
+
+    def _measure(self, model: mujoco.MjModel, data: mujoco.MjData, touching: list[int]) -> None:
+        wrench = np.zeros(6)
+        total: dict[tuple[str, str, bool], float] = {}
+        hardest: dict[tuple[str, str, bool], tuple[float, tuple[float, float, float]]] = {}
+        for number in touching:
+            mujoco.mj_contactForce(model, data, number, wrench)
+            if (force := float(wrench[0])) <= 0.0:
+                continue
+            first, second = self.pairs[number]
+            face, other = (first, second) if self._is_face[first] else (second, first)
+            if self._is_outside[face] and self._is_stopped[other]:
+                self.robot_force = max(self.robot_force, force)
+            x, y, z = self._in_head(data, data.contact.pos[number]).tolist()
+            region = self._region_at(face, x, y, z)
+            is_food = region in _EATING and not self._is_stopped[other]
+            key = region, self._toucher[other], is_food
+            total[key] = total.get(key, 0.0) + force
+            if key not in hardest or force > hardest[key][0]:
+                hardest[key] = force, (x, y, z)
+        for key, force in total.items():
+            before, impulse = self._found.get(key), force * self._dt
+            if before is not None:
+                impulse += before.impulse
+            if before is None or force > before.force:
+                self._found[key] = FaceContact(*key, force, impulse, hardest[key][1])
+            else:
+                self._found[key] = before._replace(impulse=impulse)
+
+    @property
+    def contacts(self) -> tuple[FaceContact, ...]:
+        """Contacts since `clear`."""
+        return tuple(self._found.values())
+
+    def row(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Return the row of an episode file, (R, B) float32 each, regions by touchers.
+
+        ``region_force`` is in N, ``region_impulse`` in N s.
+        """
+        force, impulse = np.zeros((2, len(REGIONS), len(self.touchers)), dtype=np.float32)
+        for contact in self._found.values():
+            place = REGIONS.index(contact.region), self.touchers.index(contact.toucher)
+            force[place] = max(force[place], contact.force)
+            impulse[place] += contact.impulse
+        return {"region_force": force, "region_impulse": impulse}
+
+    def _in_head(self, data: mujoco.MjData, point: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return (point - data.xpos[self._head]) @ data.xmat[self._head].reshape(3, 3)
+
+    def _region_at(self, geom: int, x: float, y: float, z: float) -> str:
+        """Return the region of a point of a geom, in the frame of the head.
+
+        The geoms of the visual face are larger than its regions.
+        """
+        region = self._regions[geom]
+        if region in ("head", "cheeks", "nose", "forehead"):
+            if np.linalg.norm(self._eyes - (x, y, z), axis=1).min() < EYE_REACH:
+                return "eyes"
+            if region == "head" and x > 0.0:
+                beside = "cheeks" if abs(y) > _BRIDGE else "nose"
+                return "forehead" if z > _BROWS else beside
+        if region == "mouth" and abs(y) > _WALL:
+            return "cheeks"
+        return region
+
+
+def region_of(geom: str) -> str:
+    """Return the region of a geom of the face by its name."""
+    name = geom.removeprefix("face/")
+    stem = name.rstrip("0123456789").rstrip("_")
+    if name not in _REGION_OF:
+        stem = stem.removesuffix("_left").removesuffix("_right")
+    region = _REGION_OF.get(name) or _REGION_OF.get(stem, stem)
+    if region not in REGIONS:
+        raise ValueError(f"geom '{geom}' belongs to no region of the face")
+    return region
+
+
+def toucher_of(model: mujoco.MjModel, geom: int, objects: Sequence[str]) -> str:
+    """Return what a geom is: an object of the task, wherever it hangs, or a part of an arm."""
+    body = int(model.geom_bodyid[geom])
+    while body:
+        name = model.body(body).name
+        for found in sorted(objects, key=len, reverse=True):
+            if name.startswith(found):
+                return found
+        arm, _, link = name.partition("/")
+        if arm in ARM_BASES:
+            return GRIPPER if link.startswith("gripper") or "finger" in link else ARM
+        body = int(model.body_parentid[body])
+    return OTHER
