@@ -286,6 +286,7 @@ def test_the_conditions_ship_with_the_package() -> None:
     assert {path.name for path in CONDITIONS.glob("*.yaml")} == {
         "delay.yaml",
         "demo.yaml",
+        "drinking.yaml",
         "feeding.yaml",
         "foresight_policies.yaml",
     }

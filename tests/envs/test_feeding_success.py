@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
-    CAVITY_DEPTH,
     CLEAR_DISTANCE,
     LIFT_HEIGHT,
-    LIP_DEPTH,
     FeedingProgress,
     Phase,
     StepMeasurements,
-    from_mouth,
     is_at_mouth,
+)
+from robo_manip_baselines.envs.mujoco.tasks.mouth import (
+    CAVITY_DEPTH,
+    LIP_DEPTH,
+    from_mouth,
     is_inside_mouth,
 )
 

@@ -26,6 +26,7 @@ NAMESPACE = "robo_manip_baselines"
 
 TASKS = {
     "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
+    "DrinkingEnv": "robo_manip_baselines.envs.mujoco.tasks.drinking:ENTRY",
     "BimanualFeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.bimanual_feeding:ENTRY",
 }
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
@@ -541,3 +542,30 @@ FACE_ATTRIBUTES = (
     Attribute("face_offset", "vector", "Offset of the face's base position, in m", length=3),
 )
 """Attributes that every task with a replayed face records."""
+
+FORCE_LIMITS = (1, 10, 30)
+"""N, forces on the face above which time is counted: a touch, a push, and one that hurts."""
+
+FORCE_COLUMNS = (
+    ResultColumn(
+        "face_force",
+        "float",
+        "N, largest normal force between robot and face",
+        in_report=True,
+        unit="N",
+        in_tables=True,
+    ),
+    *(
+        ResultColumn(
+            f"force_time_{limit}",
+            "float",
+            f"s, time with more than {limit} N between robot and face",
+            is_optional=True,
+            unit="s",
+            in_tables=True,
+            may_be_absent=True,
+        )
+        for limit in FORCE_LIMITS
+    ),
+)
+"""Columns of every task that records the force on the face; `FaceForce` has their values."""

@@ -3,6 +3,7 @@
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     FACE_ATTRIBUTES,
     FACE_FIELDS,
+    FORCE_COLUMNS,
     Attribute,
     Field,
     ResultColumn,
@@ -15,9 +16,6 @@ _PACKAGE = "robo_manip_baselines.envs.mujoco.tasks.feeding"
 APPROACH_LIMIT = 6.0
 """s after the lift within which the gripper should be at the mouth (paper, Algorithm 1, line 10).
 ``is_success`` has no such limit; tables count the successes within it."""
-
-FORCE_LIMITS = (1, 10, 30)
-"""N, forces on the face above which time is counted: a touch, a push, and one that hurts."""
 
 ENTRY = TaskEntry(
     name="FeedingEnv",
@@ -89,26 +87,7 @@ ENTRY = TaskEntry(
             "the lifted cube was held and its centre nearest to the mouth; null without a lift",
             is_optional=True,
         ),
-        ResultColumn(
-            "face_force",
-            "float",
-            "N, largest normal force between robot and face",
-            in_report=True,
-            unit="N",
-            in_tables=True,
-        ),
-        *(
-            ResultColumn(
-                f"force_time_{limit}",
-                "float",
-                f"s, time with more than {limit} N between robot and face",
-                is_optional=True,
-                unit="s",
-                in_tables=True,
-                may_be_absent=True,
-            )
-            for limit in FORCE_LIMITS
-        ),
+        *FORCE_COLUMNS,
         ResultColumn(
             "dwell",
             "float",

@@ -16,10 +16,9 @@ from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
     FeedingProgress,
     Phase,
     StepMeasurements,
-    from_mouth,
     is_at_mouth,
-    is_inside_mouth,
 )
+from robo_manip_baselines.envs.mujoco.tasks.mouth import from_mouth, is_inside_mouth
 
 CUBE_LOW = np.array([0.12, 0.42])
 CUBE_HIGH = np.array([0.22, 0.58])

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
-from robo_manip_baselines.envs.mujoco.tasks.feeding import FORCE_LIMITS
+from robo_manip_baselines.envs.mujoco.tasks.face_force import FaceForce, seconds
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
     MOUTH_TOLERANCE,
     Phase,
@@ -31,8 +30,7 @@ class FeedingMetrics:
     """Closest approach, contact force and dwell of one episode; see `EpisodeMetrics`."""
 
     def __init__(self) -> None:
-        self._force = 0.0
-        self._steps_above = dict.fromkeys(FORCE_LIMITS, 0)
+        self._force = FaceForce()
         self._steps_inside = 0
         self._distance: float | None = None
         self._offset: Offset | None = None
@@ -42,10 +40,7 @@ class FeedingMetrics:
 
     def update(self, info: Mapping[str, Any]) -> None:
         """Take in the ``info`` of a step."""
-        force = float(info["face_force"])
-        self._force = max(self._force, force)
-        for limit in FORCE_LIMITS:
-            self._steps_above[limit] += force > limit
+        self._force.update(float(info["face_force"]))
         if info["phase"] not in CARRYING:
             return
         gripper, mouth = np.asarray(info["gripper_position"]), np.asarray(info["mouth_position"])
@@ -69,9 +64,8 @@ class FeedingMetrics:
             "closest_distance": self._distance,
             "closest_offset": self._offset,
             "cube_offset": self._cube_offset,
-            "face_force": self._force,
-            **{f"force_time_{f}": _seconds(steps) for f, steps in self._steps_above.items()},
-            "dwell": _seconds(self._steps_inside),
+            **self._force.columns(),
+            "dwell": seconds(self._steps_inside),
         }
 
 
@@ -98,11 +92,6 @@ def failure_kind(is_success: bool, was_released: bool, closest_offset: Offset | 
     if abs(up) >= abs(across):
         return "missed_high" if up > 0.0 else "missed_low"
     return "missed_left" if across > 0.0 else "missed_right"
-
-
-def _seconds(steps: int) -> float:
-    """Return the time of control steps, without what floating point adds to it."""
-    return round(steps * CONTROL_PERIOD, 6)
 
 
 def _offset(vector: Any) -> Offset:

@@ -15,13 +15,6 @@ LIFT_HEIGHT = 0.10
 """m of the cube's centre above the table from which it counts as lifted: clear of the table by
 twice its size, and low enough that the way to the mouth still lies ahead."""
 
-LIP_DEPTH = 0.01
-"""m by which the lips stand out before the mouth's centre, the mean of all lip landmarks."""
-
-CAVITY_DEPTH = 0.05
-"""m behind the lips within which a released cube is in the mouth; a cube longer in than this would
-be in the throat."""
-
 CLEAR_DISTANCE = 0.12
 """m between gripper and mouth from which the gripper has withdrawn: three cube sizes."""
 
@@ -44,36 +37,6 @@ def is_at_mouth(gripper: NDArray[np.float64], mouth: NDArray[np.float64]) -> boo
     return bool(np.all(np.abs(gripper - mouth) < MOUTH_TOLERANCE))
 
 
-def from_mouth(
-    point: NDArray[np.float64], mouth: NDArray[np.float64], mouth_axes: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return (3,) m, a point from the mouth in the face's axes: out, across, up.
-
-    Args:
-        point: (3,) m, world frame.
-        mouth: (3,) m, centre of the opening, world frame.
-        mouth_axes: (3, 3) columns: face normal pointing out, across (to the person's left), up;
-            world frame.
-    """
-    return (point - mouth) @ mouth_axes
-
-
-def is_inside_mouth(
-    cube_offset: NDArray[np.float64], half_width: float, half_height: float
-) -> bool:
-    """Return whether the centre of the cube is in the mouth opening, past the front of the lips.
-
-    Args:
-        cube_offset: (3,) m, its centre from the mouth, see ``from_mouth``.
-        half_width: m, of the ellipse that the inner lips span.
-        half_height: m, likewise.
-    """
-    out, across, up = cube_offset
-    if not -CAVITY_DEPTH <= out <= LIP_DEPTH:
-        return False
-    return bool((across / half_width) ** 2 + (up / half_height) ** 2 <= 1.0)
-
-
 @dataclass(frozen=True)
 class StepMeasurements:
     """Measurements of one control step.
@@ -84,7 +47,7 @@ class StepMeasurements:
         is_touched: any finger touches the cube.
         cube_height: m of the cube's centre above the table.
         is_at_mouth: see the predicate of that name.
-        is_inside_mouth: likewise.
+        is_inside_mouth: the centre of the cube is, see `mouth.is_inside_mouth`.
         touches_face: the gripper touches lips or face.
         gripper_distance: m between gripper and mouth.
     """
