@@ -24,8 +24,7 @@ more wets the clothes."""
 
 GENTLE_FORCE = float(FORCE_LIMITS[1])
 """N that the spout may press with under the strict condition. A spout rests on the lower lip, so
-that touching is part of drinking. Assistive Gym penalises a tool that presses with 10 N or more;
-ISO/TS 15066 limits a robot's steady force on the muscles of the jaw to 65 N."""
+that touching is part of drinking. Assistive Gym penalises a tool that presses with 10 N or more."""
 
 LIFT_HEIGHT = 0.10
 """m above where it stood from which the cup counts as lifted, as the cube of `FeedingEnv`."""
