@@ -11,11 +11,12 @@ Shapes: N faces or rows, W recent frames, M slow means, D series, F features, H 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 SHAPES = 8
 """K: principal shapes; a rigid head that moves parallel to the image has two."""
