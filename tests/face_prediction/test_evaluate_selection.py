@@ -17,7 +17,6 @@ from face_prediction.evaluation.setup import common_folds, shuffled_partners
 from face_prediction.prediction.interface import Forecast, ImageNeeds
 from robo_manip_baselines.runs.errors import RequestError
 
-
 FOLDS = (0, 1, 2)
 
 

@@ -172,7 +172,7 @@ def test_weights_and_baselines_beside_them_are_read_back(predictor, faces, tmp_p
 
 
 def test_learning_is_weighted_ridge_regression() -> None:
-    """Against the sums written out, for one expert, one horizon of each band, and the last frame."""
+    """Against the sums written out, for one expert, at the last frame."""
     rng = np.random.default_rng(3)
     tracks = [np.cumsum(rng.normal(0, 0.01, (150, SERIES)), axis=0) for _ in range(4)]
     fit = fit_people(tracks, list("abcd"))

@@ -68,7 +68,7 @@ KINDS: dict[str, Any] = {
         *(ActConfig, ActionExecution, ApproachSettings, CheckpointDocument, CheckpointManifest),
         *(CheckpointOrigin, CheckpointRecord, ConditionConfig, ConditionsDocument, Corruption),
         *(CrossAttentionSettings, FusionSettings, ItemManifest, ManifestDocument, MetricsLine),
-        *(MlpConfig, ObservationSpec, PredictorErrorStats, FusionSettings, SequenceSettings),
+        *(MlpConfig, ObservationSpec, PredictorErrorStats, SequenceSettings),
         *(Split, StoredErrorStats, StoredNormalization, StoredTrainer, TrainSettings),
         TrainerDocument,
     )
