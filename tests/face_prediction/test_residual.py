@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.forecast.interface import mouth_centre
+from face_prediction.live.streaming import FollowingForecaster, StreamingPredictor
 from face_prediction.models.residual.adaptive import (
     BANDS,
     HORIZONS,
@@ -74,6 +76,27 @@ def test_a_history_a_track_and_a_stream_agree(predictor: ResidualPredictor, face
     assert histories.mouth_scale is not None
     assert track.scale is not None
     np.testing.assert_allclose(histories.mouth_scale[1], track.scale[69], rtol=1e-5)
+
+
+@pytest.mark.parametrize("rate", [30.0, 25.0])
+def test_live_follows_the_face(predictor: ResidualPredictor, faces, rate: float) -> None:
+    stream = StreamingPredictor(FollowingForecaster(predictor, 5), SequenceSettings())
+    size, image = np.array([400, 300]), np.zeros((300, 400, 3), np.uint8)
+    track = predictor.forecast_tracks([faces[0, :60] * 300], 5)[0]
+    forecast = None
+    for number in range(int(59 * rate / 30) + 1):
+        time = 30 * number / rate  # in frames of 30 a second
+        before = min(int(time), 58)
+        seen = faces[0, before] + (time - before) * (faces[0, before + 1] - faces[0, before])
+        landmarks = np.concatenate([seen * 300 / size, np.zeros((468, 1))], axis=1)
+        forecast = stream.update(number / rate, landmarks, image)
+    assert forecast is not None
+    moved = mouth_centre(forecast.landmarks * size) - mouth_centre(seen * 300)
+    if rate == 30.0:
+        np.testing.assert_allclose(moved, track.mouth[59], rtol=1e-6, atol=1e-9)
+    else:  # the last frame is 58.8; what was learnt is nearly the same
+        np.testing.assert_allclose(moved, track.mouth[59], atol=0.25 * np.abs(track.mouth).max())
+    assert stream.update(9.0, None, image) is None  # long gone: another face would begin anew
 
 
 def test_units_and_place_do_not_matter(predictor: ResidualPredictor, faces) -> None:
@@ -219,7 +242,8 @@ def test_slow_means_begin_as_the_mean() -> None:
     series = np.arange(30.0)[:, None] * np.ones(SERIES)
     means = slow_means(series)
     for frame in range(10):  # of the shortest memory
-        np.testing.assert_allclose(means[frame], series[: frame + 1].mean(axis=0)[None])
+        expected = np.tile(series[: frame + 1].mean(axis=0), (3, 1))
+        np.testing.assert_allclose(means[frame], expected)
 
 
 def test_a_ring_keeps_the_last_rows() -> None:

@@ -77,9 +77,7 @@ def test_a_dataset_with_one_fold_has_nobody_to_fit_to(dataset: Path, tmp_path: P
     words = ["build-dataset", root / "tracks", "--videos", root / "videos", "--folds", 1]
     words += ["--history", 8, "--future", 5, "--stride", 4, "--crop_size", 64, "--no_progress"]
     assert main([*map(str, words), "--out", str(tmp_path / "one")]) == 0
-    with pytest.raises(
-        RequestError, match=r"nobody is left to fit ar_mouth .*--baselines_from"
-    ):
+    with pytest.raises(RequestError, match=r"nobody is left to fit ar_mouth .*--baselines_from"):
         run(tmp_path / "one", tmp_path / "out", baselines=("ar_mouth",))
     # what has no parameters is there, and what was fitted to others
     record = run(tmp_path / "one", tmp_path / "out", baselines=("all",), tracks=False)
