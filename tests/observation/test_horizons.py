@@ -233,7 +233,7 @@ def test_drawn_errors_go_as_far_as_they_were_measured(tmp_path: Path, error: str
     near = tmp_path / "near"
     near.mkdir()
     short = str(write_stats(near, made_up_stats(horizons=5, runs=2)))
-    message = "error_stats.json' go 5 frames ahead; choose a horizon up to that, not 6"
+    message = r"stats_.*json' go 5 frames ahead; choose a horizon up to that, not 6"
     with pytest.raises(RequestError, match=message):
         corruption = {"error": error, "error_stats": short}
         make_env("FeedingEnv", horizon=6, corruption=corruption, **kwargs)
