@@ -234,8 +234,8 @@ def test_drawn_errors_go_as_far_as_they_were_measured(tmp_path: Path, error: str
     near.mkdir()
     short = str(write_stats(near, made_up_stats(horizons=5, runs=2)))
     message = r"stats_.*json' go 5 frames ahead; choose a horizon up to that, not 6"
+    corruption = {"error": error, "error_stats": short}
     with pytest.raises(RequestError, match=message):
-        corruption = {"error": error, "error_stats": short}
         make_env("FeedingEnv", horizon=6, corruption=corruption, **kwargs)
     longer = str(write_stats(tmp_path, made_up_stats(horizons=24, runs=2)))
     pipeline = ahead(24, Corruption(error, longer)).make_pipeline()

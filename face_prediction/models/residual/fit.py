@@ -70,7 +70,6 @@ class Rows:
         series: (N, D).
         recent: (N, W, D).
         slow: (N, M, D).
-        track: (N,) number of the track.
         person: (N,) number of the person.
         seen: (N,) frames before this one in its track.
         left: (N,) frames after it.
@@ -80,7 +79,6 @@ class Rows:
     series: Floats
     recent: Floats
     slow: Floats
-    track: NDArray[np.int64]
     person: NDArray[np.int64]
     seen: NDArray[np.int64]
     left: NDArray[np.int64]
@@ -97,7 +95,6 @@ class Rows:
             series=np.concatenate(tracks),
             recent=np.concatenate([recent_frames(track) for track in tracks]),
             slow=np.concatenate([slow_means(track) for track in tracks]),
-            track=numbers,
             person=people[numbers],
             seen=np.concatenate([np.arange(n) for n in lengths]),
             left=np.concatenate([np.arange(n)[::-1] for n in lengths]),
@@ -222,10 +219,8 @@ def fit_residual(tracks: Sequence[NDArray[np.floating]], subjects: Sequence[str]
         own, others = (np.flatnonzero((half == part) == same).tolist() for same in (True, False))
         fit = fit_people([series[i] for i in others], [subjects[i] for i in others])
         fit = replace(fit, usual=people.usual, pace=people.pace)
-        chosen = [series[i] for i in own]
-        first = trial(ResidualFit(basis, fit, blank), [part[:_MEASURED] for part in chosen])
-        # errors are measured first without knowing any, then intervals with what was measured
-        trials.append(first)
+        shown_part = [series[i][:_MEASURED] for i in own]
+        trials.append(trial(ResidualFit(basis, fit, blank), shown_part))
     usual = usual_errors(trials, people.pace)
     signs, errors = (np.concatenate([getattr(t, n) for t in trials]) for n in ("signs", "errors"))
     return ResidualFit(basis, replace(people, usual=usual), measure_intervals(signs, errors))
