@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from face_prediction.dataset.manifest import Manifest
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.dataset.tracks import FaceStretch
-from face_prediction.evaluation.predictors import EvaluatedPredictor, Role
+from face_prediction.evaluation.predictors import EvaluatedPredictor
 from face_prediction.evaluation.scoring import interval_levels
 from face_prediction.forecast.interface import mouth_centre
 from face_prediction.motion.report import markdown_table
@@ -70,7 +70,7 @@ class TrackScores:
     subjects: tuple[str, ...]
     frames: NDArray[np.int64]
     smoothness: Floats
-    rows: tuple[tuple[str, Role], ...]
+    rows: tuple[tuple[str, str], ...]
     errors: Floats
     counts: Floats
     inside: Floats

@@ -124,4 +124,5 @@ def _student_quantiles() -> tuple[Floats, Floats]:
     """Logarithms of the quantiles of the absolute value at `LEVELS`, for each of `_FREEDOM`."""
     from scipy import stats  # not at the top: the command line starts without it
 
-    return tuple(np.log(stats.t.ppf((1 + level) / 2, _FREEDOM)) for level in LEVELS)
+    middle, far = (np.log(stats.t.ppf((1 + level) / 2, _FREEDOM)) for level in LEVELS)
+    return middle, far
