@@ -3,6 +3,7 @@
 Wall-clock time, and beside it processor time, summed over threads, which other programs on the
 machine hardly touch. Networks have random weights: a trained one takes as long. Each is fed a face
 that moves in drawn images; the history is whole and the crop holds, as it does most of the time.
+``residual`` is the one that ships.
 Beside it, the same network encodes its whole history anew in every frame, and makes its pictures.
 Prints a Markdown table::
 
@@ -26,11 +27,15 @@ from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.evaluation.predictors import BaselinePredictor
 from face_prediction.forecast.extrapolation import Persistence
 from face_prediction.live.streaming import (
+    AnyForecaster,
+    FollowingForecaster,
     LandmarkForecaster,
     NetworkForecaster,
     StreamingPredictor,
 )
 from face_prediction.models.interface import History, PredictorModel
+from face_prediction.models.loading import RESIDUAL, SHIPPED, load_predictor
+from face_prediction.models.residual.predictor import ResidualPredictor
 from face_prediction.models.settings import MODELS, PRESETS, make_predictor_model, preset_settings
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 
@@ -72,7 +77,7 @@ def frame_times(run: Callable[[int], object], first: int, count: int) -> Taken:
     return Taken(*1e3 * taken)
 
 
-def streamed(forecaster: LandmarkForecaster | NetworkForecaster, frames: int) -> Taken:
+def streamed(forecaster: AnyForecaster, frames: int) -> Taken:
     """Of a streaming predictor, once it knows a whole history."""
     warm = SETTINGS.history + 5
     landmarks, images = drawn_faces(warm + frames)
@@ -121,6 +126,12 @@ def row(name: str, preset: str, frames: int) -> str:
     if name == PERSISTENCE:
         ours = streamed(LandmarkForecaster(_persistence(), 5), frames)
         return f"| {name} | | | {_cells(ours)} | | |"
+    if name == RESIDUAL:
+        predictor, _ = load_predictor(SHIPPED)
+        assert isinstance(predictor, ResidualPredictor)
+        return (
+            f"| {name} | | | {_cells(streamed(FollowingForecaster(predictor, 24), frames))} | | |"
+        )
     torch.manual_seed(0)
     network = make_predictor_model(name, preset_settings(name, preset)[0]).eval()
     needs = network.needs
@@ -144,7 +155,7 @@ def main() -> None:
     parser.add_argument(
         "--models",
         nargs="*",
-        default=[PERSISTENCE, *(m for m in MODELS if m != "image_only")],
+        default=[PERSISTENCE, RESIDUAL, *(m for m in MODELS if m != "image_only")],
         help="that forecast landmarks",
     )
     parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["cpu", "paper"])
@@ -159,7 +170,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|")
     for name in options.models:
-        for preset in options.presets if name != PERSISTENCE else [""]:
+        for preset in options.presets if name in MODELS else [""]:
             print(row(name, preset, options.frames), flush=True)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings, kind_of
 from face_prediction.motion.attribution import Attribution, find_row, read_attributions
 from face_prediction.motion.library import track_files
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder
 from robo_manip_baselines.runs.ranges import Seed
 
@@ -56,7 +56,9 @@ class BuildDatasetOptions:
         videos: Folders that hold the videos that the tracks were made from.
         out: Folder for the dataset.
         attribution: Table (.csv, or Markdown) with the columns clip, subject, ship, licence,
-            source, and optionally kind (natural, head_motion or grid) and what.
+            source, and optionally kind (natural, head_motion or grid) and what. Clips without kind
+            and what are told by how far the head turns.
+        same_person: Subjects of the table that are one person, as NAME=OTHER: NAME becomes OTHER.
         settings: Settings of the sequences.
         folds: Parts that people are divided into; 1: nobody is trained on, all are reported on.
         seed: Breaks ties when people are divided.
@@ -67,6 +69,7 @@ class BuildDatasetOptions:
     videos: tuple[Path, ...]
     out: Path = Path("face_dataset")
     attribution: Path | None = None
+    same_person: tuple[str, ...] = ()
     settings: tyro.conf.OmitArgPrefixes[SequenceSettings] = field(default_factory=SequenceSettings)
     folds: Folds = 5
     seed: Seed = 0
@@ -93,7 +96,9 @@ def _build_dataset(options: BuildDatasetOptions) -> int:
     paths = track_files(options.tracks)
     videos = find_videos(options.videos)
     rows = read_rows(paths, options.attribution)
-    kinds = {clip: kind_of(row) for clip, row in rows.items()}
+    rows = with_one_name(rows, options.same_person)
+    for row in rows.values():
+        kind_of(row)  # refuses what is no kind, before anything is read
     entries: list[ClipEntry] = []
     made = 0
     for number, path in enumerate(paths, start=1):
@@ -107,7 +112,7 @@ def _build_dataset(options: BuildDatasetOptions) -> int:
                 raise
             logger.error("%s%s", prefix, error)
             continue
-        entries.append(clip_entry(options.out, rows[path.stem], kinds[path.stem]))
+        entries.append(clip_entry(options.out, rows[path.stem]))
     if not any(entry.sequences for entry in entries):
         raise RequestError(
             f"no sequence of {options.settings.length} frames in {len(entries)} clips; "
@@ -145,6 +150,31 @@ def read_rows(tracks: Iterable[Path], table: Path | None) -> dict[str, Attributi
         what = "%d clips have no row in --attribution (%s): each counts as a person of its own"
         logger.warning(what, len(unknown), names)
     return {clip: row or Attribution(clip, clip, False) for clip, row in found.items()}
+
+
+def with_one_name(
+    rows: Mapping[str, Attribution], same_person: Sequence[str]
+) -> dict[str, Attribution]:
+    """The rows, with one name for every person.
+
+    Args:
+        rows: by clip.
+        same_person: NAME=OTHER each.
+
+    Raises:
+        RequestError: one is of another form, or there is nobody of that name.
+    """
+    names = {row.subject for row in rows.values()}
+    other: dict[str, str] = {}
+    for pair in same_person:
+        name, equals, same = pair.partition("=")
+        if not (name and equals and same):
+            raise RequestError(f"--same_person {pair}: no pair of names; valid: NAME=OTHER")
+        other[require_choice("subject of --same_person", name, names)] = same
+    return {
+        clip: replace(row, subject=other.get(row.subject, row.subject))
+        for clip, row in rows.items()
+    }
 
 
 def refuse_same_video(entries: Iterable[ClipEntry]) -> None:

@@ -20,7 +20,8 @@ COMMANDS = {
     "export-motion": "Lift face tracks to metres, and write the runs that can be trusted.",
     "export-surface": "Average face tracks into one surface with a jaw.",
     "build-dataset": "Cut face tracks and their videos into sequences to learn from.",
-    "train": "Train a network that forecasts faces.",
+    "fit": "Fit residual prediction, the predictor to use.",
+    "train": "Train a network of the paper that forecasts faces.",
     "evaluate": "Compare trained networks and baselines on people that they never saw.",
     "export-stats": "Measure the errors of forecasts of the mouth.",
     "predict": "Forecast every frame of a library of recorded motion.",
@@ -37,8 +38,8 @@ Example:
   face-prediction extract clips/*.mp4 --out face_tracks
   face-prediction export-motion face_tracks --attribution clips.csv --out face_motion.npz
   face-prediction build-dataset face_tracks --videos clips --attribution clips.csv
-  face-prediction train residual --dataset face_dataset --test_fold 0
-  face-prediction evaluate --dataset face_dataset --checkpoints checkpoints/residual_cpu_fold0_seed0
+  face-prediction fit --dataset face_dataset --test_fold 0
+  face-prediction evaluate --dataset face_dataset --checkpoints checkpoints/residual_fold0
 
 'face-prediction COMMAND --help' lists the options of a command."""
 

@@ -15,8 +15,17 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import KINDS
-from face_prediction.evaluation.figures import write_figures
-from face_prediction.evaluation.predictors import fit_baselines, group_networks, load_network
+from face_prediction.dataset.tracks import dataset_stretches
+from face_prediction.evaluation.figures import draw_gains, write_figures
+from face_prediction.evaluation.predictors import (
+    UNFITTED,
+    baselines_from,
+    fit_baselines,
+    group_networks,
+    load_network,
+    require_strangers,
+    used_folds,
+)
 from face_prediction.evaluation.scoring import score_forecasts, score_shuffled_images
 from face_prediction.evaluation.setup import (
     PERSISTENCE,
@@ -35,6 +44,12 @@ from face_prediction.evaluation.tables import (
     markdown_table_1,
     write_evaluation_report,
 )
+from face_prediction.evaluation.tracks import (
+    TrackScores,
+    score_tracks,
+    tracks_record,
+    write_tracks,
+)
 from face_prediction.evaluation.video import write_forecast_video
 from face_prediction.forecast import FORECASTERS
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, find_model
@@ -50,14 +65,21 @@ class EvaluateOptions:
     """Score trained networks beside the baselines, on people that they never saw.
 
     Every sequence is forecast by the checkpoint whose test fold holds its person; checkpoints of
-    one network for different folds are one row. Baselines are fitted to all other folds.
+    one network for different folds are one row. Weights of another dataset, such as those shipped,
+    forecast everybody, as long as they were trained on nobody here. Baselines are fitted to all
+    other folds, or to another dataset.
 
-    Example: face-prediction evaluate --dataset face_dataset --checkpoints checkpoints/residual_*
+    Example: face-prediction evaluate --dataset my_faces --checkpoints shipped
+    --baselines_from shipped
 
     Attributes:
         dataset: folder made by build-dataset.
-        checkpoints: folders written by train; none: baselines only.
-        baselines: baselines to fit: all, or names; persistence is always there.
+        checkpoints: folders written by fit or train, or shipped; none: baselines only.
+        baselines: baselines to fit: all, or names; persistence is always there. Of a dataset with
+            one fold, only those without parameters can be.
+        baselines_from: a dataset that baselines are fitted to as well, as rows of their own; or
+            shipped: those that come with the shipped weights.
+        tracks: also forecast whole tracks, from every frame, up to 24 frames ahead.
         kinds: kinds of footage to report on, each by itself.
         out: folder for tables and figures.
         detector_model: MediaPipe's face_landmarker.task, for networks that forecast images only.
@@ -75,6 +97,8 @@ class EvaluateOptions:
     dataset: Path
     checkpoints: tuple[Path, ...] = ()
     baselines: tuple[str, ...] = ("all",)
+    baselines_from: Path | None = None
+    tracks: bool = True
     kinds: tuple[str, ...] = KINDS
     out: Path = Path("results/faces")
     detector_model: Path | None = None
@@ -103,19 +127,30 @@ def _evaluate(options: EvaluateOptions) -> int:
         stack.enter_context(logging_redirect_tqdm())
         dataset_sha256 = file_digest(options.dataset / MANIFEST_NAME)
         loaded = [load_network(folder, dataset_sha256) for folder in options.checkpoints]
-        networks = group_networks(loaded)
-        require_unseen(dataset, networks)
         all_folds = dataset.manifest.folds
+        networks = group_networks(loaded, used_folds(dataset))
+        notes = [
+            require_strangers(dataset, fitted)
+            for fitted in loaded
+            if (fitted.checkpoint or {})["test_fold"] is None
+        ]
+        require_unseen(dataset, networks)
         folds = common_folds(networks) if networks else tuple(range(all_folds))
         selection = select_sequences(
             dataset, folds, options.kinds, options.max_sequences, options.seed
         )
-        names = FORECASTERS if "all" in options.baselines else options.baselines
+        names, more = baseline_names(options, all_folds)
+        notes += more
         logger.info("fitting the baselines to the people of other folds")
+        baselines = fit_baselines(dataset, (PERSISTENCE, *names), folds)
+        if options.baselines_from is not None:
+            wanted = FORECASTERS if "all" in options.baselines else options.baselines
+            baselines += baselines_from(options.baselines_from, wanted, folds)
+        require_unseen(dataset, baselines)
         setup = prepare_evaluation(
             dataset,
             selection,
-            [*fit_baselines(dataset, (PERSISTENCE, *names), folds), *networks],
+            [*baselines, *networks],
             lambda: stack.enter_context(open_detector(options.detector_model)),
         )
         partners = None
@@ -138,11 +173,22 @@ def _evaluate(options: EvaluateOptions) -> int:
             "shuffle_pictures": options.shuffle_images,
         }
         record = provenance(dataset, dataset_sha256, loaded, option_record)
-        record["notes"] = notes_on_selection(networks, folds, all_folds, options.max_sequences)
+        left_out = notes_on_selection(networks, folds, all_folds, options.max_sequences)
+        record["notes"] = [*notes, *left_out]
         history = dataset.manifest.settings.history
+        tracks: list[TrackScores] = []
+        if options.tracks:
+            stretches = [s for s in dataset_stretches(dataset, folds) if s.kind in found]
+            tracks = score_tracks(dataset.manifest, stretches, setup.predictors, options.progress)
+            record["tracks"] = tracks_record(tracks, options.resamples, options.seed)
         write_evaluation_report(options.out, EvaluationReport(summaries, history, folds, record))
         logger.info("%s: tables.md, table1.csv, table2.csv, results.json", options.out)
+        if tracks:
+            write_tracks(options.out, tracks, options.resamples, options.seed)
+            logger.info("%s: tracks.md, people.csv", options.out)
         if options.figures:
+            if tracks and networks:
+                draw_gains(options.out / "gains.png", tracks)
             write_figures(options.out, setup, scores, summaries)
             write_forecast_video(options.out / "forecast.mp4", dataset, scores, summaries[0])
             logger.info("%s: figures and a video, which show people's faces", options.out)
@@ -150,6 +196,15 @@ def _evaluate(options: EvaluateOptions) -> int:
         print(f"\n{summary.kind}, {summary.sequences} sequences")  # noqa: T201
         print(markdown_table_1(summary))  # noqa: T201
     return 0
+
+
+def baseline_names(options: EvaluateOptions, folds: int) -> tuple[list[str], list[str]]:
+    """Baselines to fit to the people of other folds, and sentences on those that cannot be."""
+    if "all" not in options.baselines:
+        return list(options.baselines), []
+    if folds > 1:
+        return list(FORECASTERS), []
+    return list(UNFITTED), ["One fold: only baselines without parameters are fitted to it."]
 
 
 def check_evaluate_options(options: EvaluateOptions) -> None:

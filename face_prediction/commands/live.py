@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
@@ -14,11 +13,18 @@ from annotated_types import Interval
 
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings
-from face_prediction.evaluation.predictors import BaselinePredictor
+from face_prediction.evaluation.predictors import UNFITTED, BaselinePredictor
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
 from face_prediction.live.loop import LiveStatistics, run_loop, video_sink, window_sink
 from face_prediction.live.sources import face_finder, live_frames
-from face_prediction.live.streaming import LandmarkForecaster, NetworkForecaster, StreamingPredictor
+from face_prediction.live.streaming import (
+    AnyForecaster,
+    FollowingForecaster,
+    LandmarkForecaster,
+    NetworkForecaster,
+    StreamingPredictor,
+)
+from face_prediction.models.loading import SHIPPED
 from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoReader, require_video
@@ -33,9 +39,6 @@ MAX_CAMERAS = 100
 """OpenCV reads hundreds as the name of a driver, and crashes at numbers below 0."""
 HORIZON = 5
 """Frames ahead (paper, IV.A)."""
-SHIPPED = "shipped"
-UNFITTED = ("persistence", "constant_velocity", "line")
-"""Baselines without parameters."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,7 @@ def check_live_options(options: LiveOptions) -> None:
 
 def load_forecaster(
     checkpoint: str, dataset: Path | None
-) -> tuple[str, LandmarkForecaster | NetworkForecaster, SequenceSettings]:
+) -> tuple[str, AnyForecaster, SequenceSettings]:
     """Name, forecasts and sequence settings of a network or a baseline.
 
     A baseline with parameters is fitted to every sequence of the dataset.
@@ -148,24 +151,23 @@ def load_forecaster(
                 known = LandmarkSequences(landmarks, tuple(opened.entry(i).subject for i in every))
         predictor = BaselinePredictor(fit_forecaster(checkpoint, known))
         return checkpoint, LandmarkForecaster(predictor, HORIZON), settings
-    folder = Path(checkpoint)
-    if checkpoint == SHIPPED:
-        folder = Path(str(files("face_prediction"))) / "assets" / "residual"
-    if not folder.is_dir():
-        what = "no network is in this package" if checkpoint == SHIPPED else "no such folder"
-        raise RequestError(
-            f"--checkpoint {checkpoint}: {what}; name a folder written by face-prediction train, "
-            f"or a baseline ({', '.join(FORECASTERS)})"
-        )
     import torch  # only where it is needed
 
     from face_prediction.models.learned import LearnedPredictor
+    from face_prediction.models.loading import load_predictor
 
+    if checkpoint != SHIPPED and not Path(checkpoint).is_dir():
+        raise RequestError(
+            f"--checkpoint {checkpoint}: no such folder; name a folder written by face-prediction "
+            f"fit or train, or a baseline ({', '.join(FORECASTERS)})"
+        )
     # one frame is too little work to share: a second thread gains nothing on an idle machine, and
     # where the cores are busy its waiting costs several times the frame
     torch.set_num_threads(1)
-    network = LearnedPredictor.load(folder)
-    settings = SequenceSettings.from_json(network.record.dataset)
-    if network.needs.frames == 0:
-        return network.name, LandmarkForecaster(network, HORIZON), settings
-    return network.name, NetworkForecaster(network.model, network.name), settings
+    predictor, record = load_predictor(checkpoint)
+    settings = SequenceSettings.from_json(record.dataset)
+    if not isinstance(predictor, LearnedPredictor):
+        return predictor.name, FollowingForecaster(predictor, HORIZON), settings
+    if predictor.needs.frames == 0:
+        return predictor.name, LandmarkForecaster(predictor, HORIZON), settings
+    return predictor.name, NetworkForecaster(predictor.model, predictor.name), settings

@@ -9,9 +9,11 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import tyro
+from annotated_types import Interval
 from numpy.typing import NDArray
 
 from face_prediction.dataset.build import find_videos, source_video
@@ -21,11 +23,14 @@ from face_prediction.dataset.histories import (
     find_origins,
     forecast_metres,
     history_images,
+    mouth_ahead,
 )
 from face_prediction.dataset.manifest import MANIFEST_NAME, Manifest
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.sequences import SequenceSettings, clip_frames
-from face_prediction.evaluation.predictors import batch_size, cross_fit
+from face_prediction.dataset.sequences import ClipFrames, SequenceSettings, clip_frames
+from face_prediction.dataset.tracks import pixel_landmarks
+from face_prediction.evaluation.predictors import batch_size, cross_fit, require_strangers
+from face_prediction.forecast.interface import mouth_centre
 from face_prediction.motion.library import (
     MOTION_LIBRARY,
     LiftedClip,
@@ -37,17 +42,18 @@ from face_prediction.motion.library import (
 )
 from face_prediction.motion.motion import MotionSettings
 from face_prediction.motion.report import markdown_table
-from face_prediction.prediction.interface import Predictor
+from face_prediction.prediction.interface import Predictor, StatefulPredictor
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest, locked_file, require_out_file
 from robo_manip_baselines.runs.progress import ProgressBar
+from robo_manip_baselines.runs.ranges import require_ranges
 
 logger = logging.getLogger(__name__)
 
-HORIZON = 5
-"""Frames ahead (paper, IV.A)."""
-_SAME_PLACE = 1e-5  # m: two liftings of one track agree to this; a library holds float32
+HORIZON = 24
+"""Frames ahead at most: 0.8 s, as far as the robot's side looks."""
+_SAME_PLACE = 1e-4  # m: two extractions of one video agree to this on different processors
 
 
 @dataclass(frozen=True)
@@ -66,10 +72,12 @@ class PredictOptions:
             licence, source.
         dataset: Folder made by build-dataset, with the people of the tracks in its folds.
         videos: Folders that hold the videos; only for a predictor that needs images.
-        checkpoints: Folders of trained networks of one kind, each of another test fold.
+        checkpoints: Folders of weights of one kind, each of another test fold; or weights that were
+            trained on nobody of the dataset, such as shipped.
         baseline: A forecaster that is fitted here, instead.
         library: The library to put forecasts into, made by export-motion from the same tracks. By
             default one is made here, as export-motion does without further options.
+        horizon: Frames ahead to forecast; networks have a longest one.
         out: The library to write.
         progress: Show a progress bar for every clip.
     """
@@ -81,6 +89,7 @@ class PredictOptions:
     checkpoints: tuple[Path, ...] = ()
     baseline: str | None = None
     library: Path | None = None
+    horizon: Annotated[int, Interval(ge=1, le=HORIZON)] = HORIZON
     out: Path = Path("face_motion_predicted.npz")
     progress: bool = True
 
@@ -92,6 +101,7 @@ def run_predict(options: PredictOptions) -> int:
         RequestError: a file cannot be used, they do not belong together, or somebody in the
             library cannot be forecast by a predictor that never saw the person.
     """
+    require_ranges(options, "--{} {}")
     inputs = [*options.tracks, options.attribution, options.dataset, *options.checkpoints]
     require_out_file(options.out, MOTION_LIBRARY, [*inputs, options.library])
     with locked_file(options.out):
@@ -105,6 +115,9 @@ def _predict(options: PredictOptions) -> int:
     with FaceDataset(options.dataset) as dataset:
         manifest = dataset.manifest
         fits = cross_fit(dataset, options.checkpoints, options.baseline)
+        for fitted in fits.by_fold.values():
+            if fitted.checkpoint is not None and fitted.checkpoint["test_fold"] is None:
+                require_strangers(dataset, fitted)
     only = None if given is None else set(given.run_clip.tolist())
     lifted, withheld = lift_clips(options.tracks, options.attribution, motion_settings, only)
     clips = [clip for clip in lifted if clip.motion.runs]
@@ -123,8 +136,9 @@ def _predict(options: PredictOptions) -> int:
         if predictor.needs.frames:
             paths[i], _ = source_video(clip.path, load_track(clip.path), videos)
     settings = manifest.settings
+    horizon = min([options.horizon, *(longest_horizon(predictor) for predictor in predictors)])
     for clip, predictor, video in zip(clips, predictors, paths, strict=True):
-        found = forecast_clip(clip, predictor, settings, video, options.progress)
+        found = forecast_clip(clip, predictor, settings, horizon, video, options.progress)
         forecasts.append(found[0])
         short[clip.row.clip] = found[1]
     library = replace(library, predicted_mouth=np.concatenate(forecasts).astype(np.float32))
@@ -199,10 +213,13 @@ def forecast_clip(
     clip: LiftedClip,
     predictor: Predictor,
     settings: SequenceSettings,
+    horizon: int,
     video: Path | None,
     progress: bool,
 ) -> tuple[NDArray[np.float64], int]:
     """Mouth positions (N, H, 3) in metres, forecast from every frame of a clip's runs.
+
+    A predictor that keeps a state follows the face from where the stretch begins that a run is in.
 
     Returns:
         The positions, and how many frames had a history shorter than the dataset's.
@@ -223,6 +240,10 @@ def forecast_clip(
     origins = find_origins(
         wanted, landmarks, image_size, clip.motion.quality, settings.history, settings.margin
     )
+    short = sum(origin.is_short for origin in origins)
+    if isinstance(predictor, StatefulPredictor):
+        ahead = follow_clip(clip, predictor, frames, wanted, horizon)
+        return _required(ahead, predictor, clip), short
     images = None
     if video is not None:
         images = history_images(
@@ -236,17 +257,49 @@ def forecast_clip(
             some = origins[first : first + size]
             histories = np.stack([crop_history(o, landmarks, image_size) for o in some])
             shown = None if images is None else np.stack([next(images) for _ in some])
-            forecast = predictor.predict(histories, shown, HORIZON)
+            forecast = predictor.predict(histories, shown, horizon)
             mouth = clip.motion.mouth
             result.append(forecast_metres(some, forecast.landmarks, landmarks, mouth, image_size))
             bar.advance(len(some))
-    ahead = np.concatenate(result)
+    return _required(np.concatenate(result), predictor, clip), short
+
+
+def _required(
+    ahead: NDArray[np.float64], predictor: Predictor, clip: LiftedClip
+) -> NDArray[np.float64]:
+    """Raise RequestError unless there is a forecast for every frame."""
     if not np.isfinite(ahead).all():
         raise RequestError(
             f"{predictor.name}: has no forecast for some frames of '{clip.row.clip}'; a library "
             "needs one for each"
         )
-    return ahead, sum(origin.is_short for origin in origins)
+    return ahead
+
+
+def follow_clip(
+    clip: LiftedClip,
+    predictor: StatefulPredictor,
+    frames: ClipFrames,
+    wanted: Sequence[int],
+    horizon: int,
+) -> NDArray[np.float64]:
+    """Mouth positions (N, H, 3) m from the ``wanted`` frames (N,), each stretch in one pass."""
+    points = np.full((len(frames), horizon, 2), np.nan)  # the mouth ahead, image coordinates
+    size = np.array(frames.image_size)
+    centre = np.full((len(frames), 2), np.nan)
+    for start, stop in clip.motion.quality.segments():
+        pixels = pixel_landmarks(frames.landmarks[start:stop], frames.image_size)
+        centre[start:stop] = mouth_centre(frames.landmarks[start:stop])
+        moved = predictor.forecast_tracks([pixels], horizon)[0].mouth
+        points[start:stop] = centre[start:stop, None] + moved / size
+    chosen = list(wanted)
+    mouth = clip.motion.mouth[chosen]
+    return mouth_ahead(mouth, centre[chosen], points[chosen], frames.image_size)
+
+
+def longest_horizon(predictor: Predictor) -> int:
+    """Frames that a predictor forecasts at most."""
+    return int(getattr(predictor, "horizon", HORIZON))
 
 
 def errors_by_clip(library: RecordedMotion) -> dict[str, dict[str, list[float]]]:

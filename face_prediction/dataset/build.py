@@ -15,6 +15,7 @@ import numpy as np
 from face_prediction.dataset.clip_file import (
     EncodedImages,
     open_clip,
+    read_array,
     read_record,
     write_clip,
 )
@@ -27,6 +28,7 @@ from face_prediction.dataset.sequences import (
     SequenceSettings,
     clip_frames,
     find_sequences,
+    kind_of,
     sequence_statistics,
 )
 from face_prediction.motion.attribution import Attribution
@@ -137,17 +139,18 @@ def build_clip(
     return True
 
 
-def clip_entry(out: Path, row: Attribution, kind: str) -> ClipEntry:
+def clip_entry(out: Path, row: Attribution) -> ClipEntry:
     """The entry of a clip whose file is in the dataset ``out``, not yet in a fold."""
     path = out / CLIP_FOLDER / f"{row.clip}.h5"
     with open_clip(path) as file:
         record: dict[str, Any] = read_record(path, file)
+        rotations = read_array(path, file, "sequences/head_rotation_range").tolist()
     kept = ("track_sha256", "video", "video_sha256", "sequences", "candidates", "dropped")
     record.setdefault("content_sha256", "")  # files of older releases
     return ClipEntry(
         clip=row.clip,
         subject=row.subject,
-        kind=kind,
+        kind=kind_of(row, rotations),
         fold=None,
         ship=row.ship,
         licence=row.licence,

@@ -17,6 +17,7 @@ from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.evaluation.scoring import LEVELS, EvaluationScores
 from face_prediction.evaluation.setup import PERSISTENCE, EvaluationSetup
 from face_prediction.evaluation.statistics import KindSummary
+from face_prediction.evaluation.tracks import FAR, TrackScores
 from face_prediction.prediction.errors import mouth_distances
 from face_prediction.prediction.interface import Forecast
 from face_prediction.tracking.geometry import LIPS
@@ -104,6 +105,30 @@ def draw_calibration(path: Path, summaries: Sequence[KindSummary]) -> None:
         axes.plot([0, 100], [0, 100], color="black", lw=0.8)
         axes.set(xlim=(0, 100), ylim=(0, 100), box_aspect=1, xlabel="nominal coverage, %")
     panels[0].set_ylabel("observed coverage, %")
+    _save_png(figure, path)
+
+
+def draw_gains(path: Path, all_scores: Sequence[TrackScores]) -> None:
+    """Error of the first network against the best baseline's, by the smoothness of the motion.
+
+    A dot is a person, the larger the more frames there are of them; frames 3-5 of whole tracks.
+    """
+    figure = new_matplotlib_figure(6.4, 4.0)
+    axes = figure.subplots()
+    for scores, colour in zip(all_scores, COLOURS, strict=False):
+        row = next(i for i, (_, role) in enumerate(scores.rows) if role == "network")
+        best = np.maximum(scores.errors[:, scores.best, FAR], 1e-300)
+        gain = 100 * (scores.errors[:, row, FAR] / best - 1)
+        seen = scores.counts[:, FAR] > 0
+        size = 6 + 4 * np.sqrt(scores.frames[seen] / 30)
+        label = f"{scores.kind}, against {scores.rows[scores.best][0]}"
+        axes.scatter(
+            scores.smoothness[seen], gain[seen], size, color=colour, alpha=0.7, label=label
+        )
+    axes.axhline(0, color="black", lw=0.8)
+    axes.set_xlabel("smoothness: correlation of a step of the mouth with the next")
+    axes.set_ylabel("error against the best baseline, %")
+    axes.legend(frameon=False)
     _save_png(figure, path)
 
 

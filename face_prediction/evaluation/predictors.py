@@ -5,7 +5,7 @@ Legend: B histories, T frames of history, H horizon, L = 468 landmarks, S side o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +31,8 @@ DETECTOR_SIDE = 256
 """Images are enlarged to at least this side (pixels), the one that the detector's second network
 works at: what it does itself with a small image loses more (the mouth of 64-pixel crops is found
 within 0.002 of a crop instead of 0.006)."""
+UNFITTED = ("persistence", "constant_velocity", "line")
+"""Baselines without parameters."""
 _IMAGE_BYTES = 64 << 20  # of images that are given to a predictor at once
 _LANDMARK_BATCH = 64  # histories at once where there are no images
 
@@ -166,19 +168,18 @@ class EvaluatedPredictor:
 def cross_fit(
     dataset: FaceDataset, checkpoints: Sequence[Path], baseline: str | None
 ) -> EvaluatedPredictor:
-    """Networks of one kind from their folders, or one baseline fitted here; exactly one is given.
+    """Weights of one kind from their folders, or one baseline fitted here; exactly one is given.
 
     Raises:
         RequestError: both or neither is given, or one of them cannot be used.
     """
     if bool(checkpoints) == (baseline is not None):
         raise RequestError(
-            "give either --checkpoints (one folder for each fold) or --baseline "
+            "give either --checkpoints (shipped, or one folder for each fold) or --baseline "
             f"({', '.join(FORECASTERS)})"
         )
+    folds = used_folds(dataset)
     if baseline is not None:
-        clips = dataset.manifest.clips
-        folds = sorted({clip.fold for clip in clips if clip.sequences and clip.fold is not None})
         return fit_baselines(dataset, [baseline], folds)[0]
     digest = file_digest(dataset.folder / MANIFEST_NAME)
     loaded = [load_network(folder, digest) for folder in checkpoints]
@@ -189,44 +190,46 @@ def cross_fit(
                 f"{other.folder}: is '{other.predictor.name}', {checkpoints[0]} is '{name}'; give "
                 "checkpoints of one kind"
             )
-    return _one_for_each_fold(name, loaded)
+    return _one_for_each_fold(name, loaded, folds)
+
+
+def used_folds(dataset: FaceDataset) -> list[int]:
+    """Folds with sequences."""
+    clips = dataset.manifest.clips
+    return sorted({clip.fold for clip in clips if clip.sequences and clip.fold is not None})
 
 
 def load_network(folder: Path, dataset_sha256: str) -> FittedPredictor:
-    """The network in ``folder``, trained with the dataset whose ``dataset.json`` has that hash.
+    """The weights in ``folder``, or those shipped.
+
+    Those trained with the dataset whose ``dataset.json`` has that hash are for its test fold.
+    Others are for everybody, as long as they know nobody: their ``test_fold`` is None.
 
     Raises:
-        RequestError: there is none, or it was trained with another dataset.
+        RequestError: there are none.
     """
-    from face_prediction.models.learned import LearnedPredictor  # PyTorch only where it is needed
+    from face_prediction.models.loading import SHIPPED, checkpoint_folder, load_predictor
 
-    network = LearnedPredictor.load(folder)
-    trained_with = network.record.dataset_sha256
-    if trained_with != dataset_sha256:
-        raise RequestError(
-            f"{folder}: was trained with another dataset ({MANIFEST_NAME} of SHA-256 "
-            f"{trained_with[:12]}, not {dataset_sha256[:12]}), whose folds are of other people; "
-            "give that one, or train again"
-        )
-    record = {
-        "folder": folder.resolve().name,
+    network, record = load_predictor(folder)
+    tested = record.folds["test"]
+    is_of_dataset = record.dataset_sha256 == dataset_sha256 and bool(tested)
+    path = checkpoint_folder(folder)
+    entry = {
+        "folder": SHIPPED if str(folder) == SHIPPED else path.resolve().name,
         "name": network.name,
-        "preset": network.record.preset,
-        "test_fold": network.test_fold,
-        "train_subjects": len(network.record.train_subjects),
-        "sha256": file_digest(folder / "model.safetensors"),
+        "preset": record.preset,
+        "test_fold": tested[0] if is_of_dataset else None,
+        "train_subjects": len(record.train_subjects),
+        "sha256": file_digest(path / "model.safetensors"),
     }
-    shared = {
-        "settings": network.record.settings,
-        "training": network.record.training,
-        "dataset": network.record.dataset,
-    }
-    subjects = frozenset(network.record.train_subjects)
-    return FittedPredictor(network, subjects, folder, record, shared)
+    shared = {"settings": record.settings, "training": record.training, "dataset": record.dataset}
+    return FittedPredictor(network, frozenset(record.train_subjects), path, entry, shared)
 
 
-def group_networks(loaded: Sequence[FittedPredictor]) -> list[EvaluatedPredictor]:
-    """Trained networks, those of one name and preset as one evaluated predictor.
+def group_networks(
+    loaded: Sequence[FittedPredictor], folds: Sequence[int]
+) -> list[EvaluatedPredictor]:
+    """Weights, those of one name and preset as one evaluated predictor, for ``folds`` at most.
 
     The preset is part of the name in tables where there are several of a network's name.
 
@@ -239,9 +242,53 @@ def group_networks(loaded: Sequence[FittedPredictor]) -> list[EvaluatedPredictor
         groups.setdefault((record["name"], record["preset"]), []).append(fitted)
     names = [name for name, _ in groups]
     return [
-        _one_for_each_fold(name if names.count(name) == 1 else f"{name} ({preset})", group)
+        _one_for_each_fold(name if names.count(name) == 1 else f"{name} ({preset})", group, folds)
         for (name, preset), group in groups.items()
     ]
+
+
+def require_strangers(dataset: FaceDataset, fitted: FittedPredictor) -> str:
+    """Require that weights from elsewhere were trained on nobody in ``dataset``, by their names.
+
+    Returns:
+        A sentence for readers of tables.
+
+    Raises:
+        RequestError: they were.
+    """
+    people = {clip.subject for clip in dataset.manifest.clips if clip.sequences}
+    if known := sorted(people & fitted.subjects):
+        names = ", ".join(known[:5] + ["..."] * (len(known) > 5))
+        raise RequestError(
+            f"{fitted.folder}: was trained on {len(known)} of the {len(people)} people of "
+            f"{dataset.folder} ({names}), and is judged only on people whom it never saw; leave "
+            "them out, or give weights of this dataset's folds (face-prediction fit --test_fold)"
+        )
+    record = fitted.checkpoint or {}
+    return (
+        f"{record.get('name')} from {record.get('folder')} was trained on {len(fitted.subjects)} "
+        f"people, of whose names none is among the {len(people)} here."
+    )
+
+
+def dataset_landmarks(
+    dataset: FaceDataset, folds: Collection[int], clips: Collection[str] | None = None
+) -> LandmarkSequences:
+    """All sequences of the people in ``folds``, of ``clips`` if given.
+
+    Raises:
+        RequestError: there is none.
+    """
+    indices = [
+        index
+        for index in dataset.indices(folds=folds).tolist()
+        if clips is None or dataset.entry(index).clip in clips
+    ]
+    if not indices:
+        raise RequestError(f"{dataset.folder}: no sequence of anybody to fit to")
+    # copies of u and v: a view would keep the depth in memory, too
+    landmarks = np.stack([dataset.landmarks(index)[..., :2].copy() for index in indices])
+    return LandmarkSequences(landmarks, tuple(dataset.entry(index).subject for index in indices))
 
 
 def fit_baselines(
@@ -253,21 +300,61 @@ def fit_baselines(
         RequestError: there is no forecaster of a name, or nobody in other folds to fit it to.
     """
     by_fold = {require_choice("baseline", name, FORECASTERS): {} for name in names}
-    # copies of u and v: a view would keep the depth in memory, too
-    frames = [dataset.landmarks(index)[..., :2].copy() for index in range(len(dataset))]
+    fitted = [name for name in by_fold if name not in UNFITTED]
+    everybody = range(dataset.manifest.folds)
+    landmarks = dataset_landmarks(dataset, everybody)
+    of_fold = {clip.subject: clip.fold for clip in dataset.manifest.clips}
+    fold_of = np.array([of_fold[subject] for subject in landmarks.subjects])
     for fold in folds:
-        known = dataset.indices(folds={*range(dataset.manifest.folds)} - {fold}).tolist()
-        if not known:
+        known = np.flatnonzero(fold_of != fold).tolist()
+        if fitted and not known:
             raise RequestError(
                 f"{dataset.folder}: all its people are in fold {fold}, so nobody is left to fit "
-                "the baselines to; build it with --folds 2 or more"
+                f"{', '.join(fitted)} to; build it with --folds 2 or more, give --baselines_from, "
+                f"or --baselines {' '.join(UNFITTED)}"
             )
-        subjects = tuple(dataset.entry(index).subject for index in known)
-        sequences = LandmarkSequences(np.stack([frames[index] for index in known]), subjects)
-        for name, fitted in by_fold.items():
-            predictor = BaselinePredictor(fit_forecaster(name, sequences))
-            fitted[fold] = FittedPredictor(predictor, frozenset(subjects))
-    return [EvaluatedPredictor(name, fitted, "baseline") for name, fitted in by_fold.items()]
+        subjects = tuple(landmarks.subjects[index] for index in known)
+        for name, rows in by_fold.items():
+            if name in UNFITTED:
+                predictor = BaselinePredictor(fit_forecaster(name, landmarks))
+                rows[fold] = FittedPredictor(predictor, frozenset())
+                continue
+            others = LandmarkSequences(landmarks.landmarks[known], subjects)
+            predictor = BaselinePredictor(fit_forecaster(name, others))
+            rows[fold] = FittedPredictor(predictor, frozenset(subjects))
+    return [EvaluatedPredictor(name, rows, "baseline") for name, rows in by_fold.items()]
+
+
+def baselines_from(
+    source: Path, names: Iterable[str], folds: Sequence[int]
+) -> list[EvaluatedPredictor]:
+    """Baselines with parameters, fitted to all people of another dataset, or shipped.
+
+    Args:
+        source: folder made by build-dataset; ``shipped``; or a folder written by fit.
+        names: of baselines; those without parameters are left out.
+        folds: of the dataset that they are judged on.
+
+    Raises:
+        RequestError: the source is neither.
+    """
+    from face_prediction.models.loading import load_baselines
+
+    wanted = [name for name in names if name not in UNFITTED]
+    if (source / MANIFEST_NAME).is_file():
+        with FaceDataset(source) as other:
+            sequences = dataset_landmarks(other, range(other.manifest.folds))
+        forecasters = [fit_forecaster(name, sequences) for name in wanted]
+        subjects = frozenset(sequences.subjects)
+    else:
+        stored, subjects = load_baselines(source)
+        forecasters = [forecaster for forecaster in stored if forecaster.name in wanted]
+    result: list[EvaluatedPredictor] = []
+    for forecaster in forecasters:
+        fitted = FittedPredictor(BaselinePredictor(forecaster), subjects, source)
+        name = f"{forecaster.name} ({source.name})"
+        result.append(EvaluatedPredictor(name, dict.fromkeys(folds, fitted), "baseline"))
+    return result
 
 
 def batch_size(needs: ImageNeeds) -> int:
@@ -276,16 +363,19 @@ def batch_size(needs: ImageNeeds) -> int:
     return _LANDMARK_BATCH if one == 0 else int(np.clip(_IMAGE_BYTES // one, 1, _LANDMARK_BATCH))
 
 
-def _one_for_each_fold(name: str, networks: Sequence[FittedPredictor]) -> EvaluatedPredictor:
+def _one_for_each_fold(
+    name: str, networks: Sequence[FittedPredictor], folds: Sequence[int]
+) -> EvaluatedPredictor:
     by_fold: dict[int, FittedPredictor] = {}
     for fitted in networks:
         fold = (fitted.checkpoint or {})["test_fold"]
-        first = by_fold.setdefault(fold, fitted)
-        if first.folder != fitted.folder:
-            raise RequestError(
-                f"{first.folder} and {fitted.folder} are both {name} for test fold {fold}; give "
-                "one checkpoint for each fold"
-            )
+        for own in folds if fold is None else [fold]:
+            first = by_fold.setdefault(own, fitted)
+            if first.folder != fitted.folder:
+                raise RequestError(
+                    f"{first.folder} and {fitted.folder} are both {name} for test fold {own}; give "
+                    "one checkpoint for each fold, or one that was trained on nobody here"
+                )
         _require_same_settings(name, networks[0], fitted)
     return EvaluatedPredictor(name, dict(sorted(by_fold.items())))
 

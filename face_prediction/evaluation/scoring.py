@@ -94,14 +94,15 @@ def interval_levels(
     Args:
         residuals: (N, H, 2) forecast minus truth.
         scale: (N, H, 2) of a Student-t error, in the same unit.
-        degrees_of_freedom: (H, 2) of it; infinite: a Gaussian.
+        degrees_of_freedom: (H, 2) or (N, H, 2) of it; infinite: a Gaussian.
 
     Raises:
         RequestError: shapes differ, or a scale or a number of degrees is not positive.
     """
     from scipy import stats  # not at the top: the command line starts without it
 
-    if scale.shape != residuals.shape or degrees_of_freedom.shape != residuals.shape[1:]:
+    shapes = (residuals.shape, residuals.shape[1:])
+    if scale.shape != residuals.shape or degrees_of_freedom.shape not in shapes:
         raise RequestError(
             f"scale {scale.shape} and degrees of freedom {degrees_of_freedom.shape} for residuals "
             f"of shape {residuals.shape}"

@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from face_prediction.dataset.histories import dataset_image
 from face_prediction.dataset.sequences import SequenceSettings
-from face_prediction.prediction.interface import ImageNeeds, Predictor
+from face_prediction.prediction.interface import (
+    FaceFollower,
+    ImageNeeds,
+    Predictor,
+    StatefulPredictor,
+)
 from face_prediction.tracking.extract import MAX_GAP, SAME_TIME
 from face_prediction.tracking.geometry import Crop, crop_around, image_points
 from face_prediction.tracking.tracks import NUM_LANDMARKS
@@ -81,6 +86,15 @@ class LandmarkForecaster:
         return self.predictor.predict(landmarks[None], None, self.horizon).landmarks[0]
 
 
+@dataclass(frozen=True)
+class FollowingForecaster:
+    """Forecasts of a predictor that keeps learning from the face for as long as it is watched."""
+
+    predictor: StatefulPredictor
+    horizon: int
+    needs = ImageNeeds(frames=0, size=0)
+
+
 class NetworkForecaster:
     """Features and forecasts of one network on its device; each image is encoded once.
 
@@ -127,6 +141,9 @@ class NetworkForecaster:
         import torch
 
         return torch.from_numpy(np.ascontiguousarray(values))[None].to(self._device)
+
+
+AnyForecaster = LandmarkForecaster | FollowingForecaster | NetworkForecaster
 
 
 @dataclass
@@ -180,9 +197,7 @@ class StreamingPredictor:
     Settings are of the sequences that the forecaster was trained on: history, rate, margin, images.
     """
 
-    def __init__(
-        self, forecaster: LandmarkForecaster | NetworkForecaster, settings: SequenceSettings
-    ) -> None:
+    def __init__(self, forecaster: AnyForecaster, settings: SequenceSettings) -> None:
         self._forecaster, self._settings = forecaster, settings
         self.reset()
 
@@ -190,6 +205,8 @@ class StreamingPredictor:
         """Forget everything."""
         self._frames: deque[_Frame] = deque()
         self._crop: Crop | None = None
+        self._follower: FaceFollower | None = None
+        self._followed = 0.0  # s, until when the follower has been told
 
     def update(
         self, time: float, landmarks: NDArray[np.floating] | None, image: NDArray[np.uint8]
@@ -221,6 +238,10 @@ class StreamingPredictor:
         points = np.stack([frame.landmarks for frame in frames])
         size = (image.shape[1], image.shape[0])
         crop, is_new = self._lay_crop(float(wanted[0]), size)
+        known = int(np.sum(wanted >= times[0] - SAME_TIME))
+        if isinstance(self._forecaster, FollowingForecaster):
+            ahead = self._follow(self._forecaster, times, points, size) / size
+            return LiveForecast(ahead, crop, is_new, known)
         history = crop.normalise(landmarks_at(wanted, times, points), size)
         history = history[..., :2].astype(np.float32)
         if isinstance(self._forecaster, LandmarkForecaster):
@@ -231,8 +252,31 @@ class StreamingPredictor:
             for frame in frames:  # too old to be looked at again, whatever the crop will be
                 if frame.time < wanted[-needs.frames] - MAX_GAP - SAME_TIME:
                     frame.image = frame.cut = None
-        known = int(np.sum(wanted >= times[0] - SAME_TIME))
         return LiveForecast(image_points(crop, ahead, size), crop, is_new, known)
+
+    def _follow(
+        self,
+        forecaster: FollowingForecaster,
+        times: NDArray[np.float64],
+        points: NDArray[np.floating],
+        size: tuple[int, int],
+    ) -> NDArray[np.float64]:
+        """Landmarks (H, L, 2) ahead in pixels, by what was learnt at a constant rate so far.
+
+        The predictor learns on a clock of its own, which began with the face; it forecasts from
+        frames counted back from the newest one.
+        """
+        period, predictor = 1 / self._settings.fps, forecaster.predictor
+        if self._follower is None:
+            self._follower, self._followed = predictor.follow(), times[-1] - period
+        ticks = int((times[-1] + SAME_TIME - self._followed) / period)
+        due = self._followed + period * np.arange(1, ticks + 1)
+        for landmarks in landmarks_at(due, times, points):
+            self._follower.update(landmarks[:, :2] * size)
+        self._followed += period * ticks
+        back = times_back(float(times[-1]), predictor.recent, self._settings.fps)
+        recent = landmarks_at(back, times, points)[..., :2] * size
+        return self._follower.forecast(recent, forecaster.horizon)
 
     def _lay_crop(self, oldest: float, size: tuple[int, int]) -> tuple[Crop, bool]:
         """The old crop, or one around the faces since ``oldest``; whether it is new."""

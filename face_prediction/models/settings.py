@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from annotated_types import Interval, Len
@@ -193,65 +193,10 @@ class CrossAttentionSettings(FusionSettings):
     attention_width: Annotated[int, Interval(ge=1, le=2048)] = 256
 
 
-@dataclass(frozen=True)
-class ResidualSettings(ModelSettings):
-    """Settings of residual prediction: sizes of the correction, and weights of the loss.
-
-    Attributes:
-        size: side of the images in pixels, seen and predicted.
-        pictures: images seen, the last of the history; each but the first beside its difference to
-            the one before.
-        region: side in pixels of the crops of mouth, eyes and face.
-        channels: of the convolutions over the regions, each of which halves them.
-        width: of the landmarks' code and of the regions' tokens.
-        refiner: channels of the convolutions that refine the warped image.
-        dropout: on the inputs of the layers.
-        shapes: principal shapes of displacement in which landmarks are predicted.
-        history: frames of landmarks that the prior adapts to.
-        recent: frames of landmarks, the last of them, that the network sees.
-        horizon: frames predicted.
-        mouth_weight: of the mouth's absolute error, where the likelihood of it counts 1.
-        landmark_weight: of the absolute error of all landmarks.
-        picture_weight: of the absolute error of the images.
-    """
-
-    cpu: ClassVar[Mapping[str, Any]] = {
-        "size": 128,
-        "region": 24,
-        "channels": (12, 24, 48),
-        "width": 48,
-        "refiner": 12,
-    }
-
-    size: ImageSize = 256
-    pictures: Annotated[int, Interval(ge=2, le=64)] = 4
-    region: Annotated[int, Interval(ge=8, le=256)] = 48
-    channels: Channels = (32, 64, 128)
-    width: Annotated[int, Interval(ge=4, le=2048)] = 128
-    refiner: Annotated[int, Interval(ge=1, le=1024)] = 32
-    dropout: Annotated[float, Interval(ge=0.0, le=0.9)] = 0.2
-    shapes: Annotated[int, Interval(ge=2, le=64)] = 8
-    history: Annotated[int, Interval(ge=16, le=10_000)] = 64
-    recent: Annotated[int, Interval(ge=2, le=10_000)] = 32
-    horizon: Annotated[int, Interval(ge=1, le=30)] = 5
-    mouth_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 1.0
-    landmark_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 0.3
-    picture_weight: Annotated[float, Interval(ge=0.0, le=1e6)] = 10.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, value in (("recent", self.recent), ("pictures", self.pictures)):
-            if value > self.history:
-                valid = f"valid: at most history={self.history}"
-                raise RequestError(f"setting {name}={value}: too many; {valid}")
-        self._require_halvings(self.region, self.channels, least=1)
-
-
 MODELS: dict[str, tuple[type[ModelSettings], str]] = {
     "image_only": (ApproachSettings, "approaches:ImageOnlyModel"),
     "simple_fusion": (FusionSettings, "approaches:SimpleFusionModel"),
     "cross_attention": (CrossAttentionSettings, "approaches:CrossAttentionModel"),
-    "residual": (ResidualSettings, "residual.model:ResidualModel"),
 }
 """Settings of every network, and the module and class that are loaded when it is made."""
 
@@ -266,10 +211,6 @@ _CPU_TRAINING = PredictorTrainSettings(
     warmup_steps=100,
     augment=True,
     validate_every=400,
-)
-# A step has eleven origins of each sequence; what is learnt is small beside the fitted prior.
-_CPU_RESIDUAL_TRAINING = replace(
-    _CPU_TRAINING, steps=500, batch_size=16, warmup_steps=50, ema_decay=0.99, validate_every=100
 )
 
 
@@ -306,5 +247,4 @@ def preset_settings(model: str, preset: str) -> tuple[ModelSettings, PredictorTr
         raise RequestError(f"--preset {preset}: unknown; valid: {', '.join(PRESETS)}")
     if preset == "paper":
         return settings(), PredictorTrainSettings()
-    training = _CPU_RESIDUAL_TRAINING if model == "residual" else _CPU_TRAINING
-    return settings(**settings.cpu), training
+    return settings(**settings.cpu), _CPU_TRAINING

@@ -66,9 +66,7 @@ class FaceTrainOptions:
         progress: Show a progress bar (on a terminal) or lines about progress.
     """
 
-    model: tyro.conf.Positional[
-        Literal["image_only", "simple_fusion", "cross_attention", "residual"]
-    ]
+    model: tyro.conf.Positional[Literal["image_only", "simple_fusion", "cross_attention"]]
     dataset: Path = Path("face_dataset")
     test_fold: NonNegativeInt | None = 0
     hold_out: Literal["next", "none"] = "next"

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from face_prediction.commands.build_dataset import with_one_name
 from face_prediction.dataset.manifest import ClipEntry, assign_folds, fold_split
 from face_prediction.dataset.sequences import kind_of
 from face_prediction.motion.attribution import Attribution, read_attributions
@@ -138,3 +139,32 @@ def test_kinds_from_tables(tmp_path: Path) -> None:
     )
     kinds = {clip: kind_of(row) for clip, row in read_attributions(table).items()}
     assert kinds == {"a": "head_motion", "b": "grid", "c": "natural"}
+
+
+@pytest.mark.parametrize(
+    ("what", "rotations", "expected"),
+    [
+        ("", [19.9, 3.0, 25.0], "natural"),
+        ("", [20.0], "head_motion"),
+        ("", [], "natural"),
+        ("talk", [90.0], "natural"),
+        ("nod", [1.0], "head_motion"),
+    ],
+)
+def test_clips_that_nobody_described_are_told_by_how_far_the_head_turns(
+    what: str, rotations: list[float], expected: str
+) -> None:
+    row = Attribution("clip", "ann", True, "MIT", "here", what=what)
+    assert kind_of(row, rotations) == expected
+
+
+def test_two_names_of_one_person_become_one() -> None:
+    rows = {name: Attribution(name, name, True) for name in ("ann", "bob", "cat")}
+    merged = with_one_name(rows, ["bob=ann", "cat=eve"])
+    assert {clip: row.subject for clip, row in merged.items()} == {
+        "ann": "ann", "bob": "ann", "cat": "eve",
+    }  # fmt: skip
+    with pytest.raises(RequestError, match="--same_person bob: no pair of names; valid: NAME=OTHE"):
+        with_one_name(rows, ["bob"])
+    with pytest.raises(RequestError, match="subject of --same_person 'dan'"):
+        with_one_name(rows, ["dan=ann"])

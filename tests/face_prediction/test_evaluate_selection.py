@@ -17,6 +17,8 @@ from face_prediction.evaluation.setup import common_folds, shuffled_partners
 from face_prediction.prediction.interface import Forecast, ImageNeeds
 from robo_manip_baselines.runs.errors import RequestError
 
+FOLDS = (0, 1, 2)
+
 
 @dataclass
 class Network:
@@ -44,7 +46,7 @@ def loaded(*given: tuple[str, int, str], folders: tuple[str, ...] = ()) -> list[
 
 
 def test_checkpoints_of_one_network_are_one_row() -> None:
-    rows = group_networks(loaded(("a", 1, "cpu"), ("b", 0, "cpu"), ("a", 0, "cpu")))
+    rows = group_networks(loaded(("a", 1, "cpu"), ("b", 0, "cpu"), ("a", 0, "cpu")), FOLDS)
     assert [(row.name, row.role, tuple(row.by_fold)) for row in rows] == [
         ("a", "network", (0, 1)),
         ("b", "network", (0,)),
@@ -54,14 +56,14 @@ def test_checkpoints_of_one_network_are_one_row() -> None:
 
 
 def test_two_presets_are_two_rows_that_can_be_told_apart() -> None:
-    rows = group_networks(loaded(("a", 0, "cpu"), ("a", 0, "paper"), ("b", 0, "cpu")))
+    rows = group_networks(loaded(("a", 0, "cpu"), ("a", 0, "paper"), ("b", 0, "cpu")), FOLDS)
     assert [row.name for row in rows] == ["a (cpu)", "a (paper)", "b"]
 
 
 def test_the_same_network_twice_for_a_fold_is_refused_by_name() -> None:
     twice = loaded(("a", 2, "cpu"), ("a", 2, "cpu"), ("a", 2, "paper"), folders=("one", "two"))
     with pytest.raises(RequestError, match=r"one and two are both a \(cpu\) for test fold 2"):
-        group_networks(twice)
+        group_networks(twice, FOLDS)
 
 
 @pytest.mark.parametrize(
@@ -74,13 +76,13 @@ def test_the_same_network_twice_for_a_fold_is_refused_by_name() -> None:
 def test_folds_of_other_settings_are_no_row(part: dict[str, dict[str, int]], message: str) -> None:
     same = {"settings": {"steps": 20}, "training": {"steps": 20}}
     one, other = loaded(("a", 0, "cpu"), ("a", 1, "cpu"), folders=("one", "two"))
-    group_networks([replace(one, shared=same), replace(other, shared=same)])
+    group_networks([replace(one, shared=same), replace(other, shared=same)], FOLDS)
     with pytest.raises(RequestError, match=f"one and two are both a, with .*({message})"):
-        group_networks([replace(one, shared=same), replace(other, shared={**same, **part})])
+        group_networks([replace(one, shared=same), replace(other, shared={**same, **part})], FOLDS)
 
 
 def test_networks_without_a_common_fold_are_refused() -> None:
-    rows = group_networks(loaded(("a", 1, "cpu"), ("a", 2, "cpu"), ("b", 0, "cpu")))
+    rows = group_networks(loaded(("a", 1, "cpu"), ("a", 2, "cpu"), ("b", 0, "cpu")), FOLDS)
     with pytest.raises(RequestError, match=r"no fold is covered by all .*a: 1, 2; b: 0"):
         common_folds(rows)
 
@@ -116,3 +118,14 @@ def test_the_permutation_follows_from_the_seed() -> None:
     first = shuffled_partners(kinds, subjects, 1)
     np.testing.assert_array_equal(first, shuffled_partners(kinds, subjects, 1))
     assert np.any(first != shuffled_partners(kinds, subjects, 2))
+
+
+def test_weights_of_elsewhere_are_for_every_fold() -> None:
+    one = loaded(("a", 0, "cpu"))[0]
+    foreign = replace(one, checkpoint={"name": "a", "test_fold": None, "preset": "cpu"})
+    (row,) = group_networks([foreign], FOLDS)
+    assert tuple(row.by_fold) == FOLDS
+    assert row.predictor_for(2, "bob") is one.predictor
+    other = replace(one, folder=Path("other"))
+    with pytest.raises(RequestError, match="one that was trained on nobody here"):
+        group_networks([foreign, other], FOLDS)

@@ -68,6 +68,7 @@ class Folder:
             dataset=self.root / "data",
             videos=(self.root / "videos",),
             baseline="persistence",
+            horizon=5,
             library=self.root / "motion.npz",
             out=self.root / "predicted.npz",
             progress=False,

@@ -99,14 +99,14 @@ def test_networks_that_do_not_belong_together_are_refused(dataset: Path, trained
     other = {
         "are both cross_attention for test fold 0": trained(0, name="again"),
         "is 'simple_fusion', .* is 'cross_attention'": trained(1, model="simple_fusion"),
-        "trained with another dataset": trained(1, dataset_sha256="f" * 64),
+        "give one checkpoint for each fold, or one": trained(1, dataset_sha256="f" * 64),
     }
     with FaceDataset(dataset) as opened:
         for message, folder in other.items():
             with pytest.raises(RequestError, match=message) as caught:
                 cross_fit(opened, [first, folder], None)
             assert str(folder) in str(caught.value)
-        with pytest.raises(RequestError, match="no such file"):
+        with pytest.raises(RequestError, match="no such folder"):
             cross_fit(opened, [dataset / "nowhere"], None)
 
 

@@ -17,8 +17,6 @@ from torch import Tensor, nn
 
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.models.interface import Future, History
-from face_prediction.models.residual.model import ResidualModel
-from face_prediction.models.residual.prior import AdaptivePrior
 from face_prediction.models.settings import make_predictor_model, settings_class
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
@@ -178,18 +176,6 @@ FACE_SETTINGS: dict[str, dict[str, Any]] = {
     "image_only": APPROACH,
     "simple_fusion": {**APPROACH, "landmark_width": 10},
     "cross_attention": {**APPROACH, "landmark_width": 10, "attention_width": 12},
-    "residual": {
-        "size": 32,
-        "pictures": 3,
-        "region": 8,
-        "channels": [8, 16],
-        "width": 16,
-        "refiner": 8,
-        "dropout": 0.0,
-        "history": 24,
-        "recent": 12,
-        "horizon": 3,
-    },
 }
 """Sizes of the networks; convolutions have multiples of 8 channels, because oneDNN of PyTorch 2.13
 corrupts memory in the backward pass of smaller ones."""
@@ -205,24 +191,12 @@ def moving_faces(count: int, frames: int) -> Tensor:
     return (0.5 + (face - 0.5) * stretch + sway).float()
 
 
-def fill_prior(prior: AdaptivePrior) -> None:
-    """Fill what is fitted; the fit itself has the signs of singular vectors, which are free."""
-    for index, (name, buffer) in enumerate(prior.named_buffers()):
-        if name.startswith(("scale", "step")):
-            buffer.copy_(0.02 + fill(buffer.shape, index, 0.01))
-        else:
-            buffer.copy_(fill(buffer.shape, index, math.sqrt(3.0 / buffer.shape[1])))
-
-
 def face_step(name: str) -> dict[str, Any]:
     """Losses before and after one step of Adam; norms of all gradients and of weights after it."""
     model = make_predictor_model(name, settings_class(name)().changed(FACE_SETTINGS[name]))
     fill_parameters(model)
-    if isinstance(model, ResidualModel):
-        fill_prior(model.prior)
-    else:
-        faces = LandmarkSequences(moving_faces(4, 9).numpy(), tuple("abcd"))
-        model.prepare(faces, torch.Generator())
+    faces = LandmarkSequences(moving_faces(4, 9).numpy(), tuple("abcd"))
+    model.prepare(faces, torch.Generator())
     landmarks = moving_faces(2, model.history + model.horizon)
     frames = model.needs.frames
     images = (127.5 + fill((2, frames + model.horizon, 32, 32, 3), 6, 127.5)).to(torch.uint8)

@@ -57,7 +57,7 @@ def test_uniform_is_the_papers() -> None:
     """Within the bounds of equations 6 and 7, evenly, each number on its own."""
     stats = load_error_stats()
     drawn = draw("uniform", stats)
-    assert drawn.shape == (FRAMES, 5, 2)
+    assert drawn.shape == (FRAMES, 24, 2)
     share = drawn / stats.mean_abs
     five = 5.0 / np.sqrt(FRAMES)
     assert 0.999 < np.abs(share).max() <= 1.0
@@ -66,7 +66,7 @@ def test_uniform_is_the_papers() -> None:
     np.testing.assert_allclose((share**2).mean(axis=0), 1 / 3, atol=five * 0.3)
     np.testing.assert_allclose(correlation(share, 1), 0.0, atol=five)
     between = np.corrcoef(share.reshape(FRAMES, -1).T)
-    assert np.abs(between - np.eye(10)).max() < five
+    assert np.abs(between - np.eye(48)).max() < five
 
 
 def test_gaussian_has_the_files_statistics(stats: ErrorStats) -> None:
@@ -122,7 +122,9 @@ def test_gaussian_follows_the_shipped_file() -> None:
     """Errors of overlapping forecasts are no mixture of AR(1): the largest are met best."""
     stats = load_error_stats()
     drawn = draw("gaussian", stats)
-    assert_covariances_agree(drawn, stats.covariance, CLOSE)
+    # Errors 24 frames ahead last for seconds: too few of them are drawn to measure a covariance.
+    _, gain, _ = DRAWN_ERRORS["gaussian"](stats).args
+    np.testing.assert_allclose(gain @ gain.T, stats.covariance, rtol=1e-9, atol=1e-15)
     apart = np.abs(correlation(drawn, stats.stride) - stats.autocorrelation[1])
     assert apart.max() < 0.4
     assert apart[-2:].max() < 0.15

@@ -40,13 +40,13 @@ def test_a_crop_is_smaller_than_the_picture(tmp_path: Path) -> None:
 
 def test_the_shipped_file_is_read_and_small() -> None:
     stats = load_error_stats()
-    assert stats.horizons == 5
+    assert stats.horizons == 24
     assert len(stats.runs) > 1
     assert stats.source == DEFAULT_STATS
-    assert DEFAULT_STATS.stat().st_size < 300_000
+    assert DEFAULT_STATS.stat().st_size < 1_000_000
     # Errors grow with the horizon and are those of a forecast of a face half a metre away.
     assert (np.diff(stats.mean_abs, axis=0) > 0).all()
-    assert 1e-4 < stats.mean_abs.min() < stats.mean_abs.max() < 0.02
+    assert 1e-4 < stats.mean_abs.min() < stats.mean_abs.max() < 0.05
 
 
 def test_another_file_than_before_is_refused(tmp_path: Path) -> None:

@@ -229,10 +229,14 @@ def test_a_library_shows_as_far_as_it_predicts(tmp_path: Path, frames: int) -> N
 @pytest.mark.parametrize("error", ["uniform", "gaussian", "empirical"])
 def test_drawn_errors_go_as_far_as_they_were_measured(tmp_path: Path, error: str) -> None:
     kwargs = {"obs": "current_pred", "cameras": ()}
-    make_env("FeedingEnv", horizon=5, corruption={"error": error}, **kwargs).close()
-    message = "error_stats.json' go 5 frames ahead; choose a horizon up to that, not 6"
+    make_env("FeedingEnv", horizon=24, corruption={"error": error}, **kwargs).close()
+    near = tmp_path / "near"
+    near.mkdir()
+    short = str(write_stats(near, made_up_stats(horizons=5, runs=2)))
+    message = r"stats_.*json' go 5 frames ahead; choose a horizon up to that, not 6"
+    corruption = {"error": error, "error_stats": short}
     with pytest.raises(RequestError, match=message):
-        make_env("FeedingEnv", horizon=6, corruption={"error": error}, **kwargs)
+        make_env("FeedingEnv", horizon=6, corruption=corruption, **kwargs)
     longer = str(write_stats(tmp_path, made_up_stats(horizons=24, runs=2)))
     pipeline = ahead(24, Corruption(error, longer)).make_pipeline()
     assert pipeline is not None
@@ -255,7 +259,7 @@ def test_old_and_new_files_of_a_seed_show_the_same_and_replay(tmp_path: Path) ->
     with EpisodeReader(path) as episode:
         assert episode.attributes["schema_version"] == 3
         assert episode.array("mouth_position").shape[1:] == (25, 3)
-        assert episode.array("predicted_mouth").shape[1:] == (5, 3)
+        assert episode.array("predicted_mouth").shape[1:] == (24, 3)
         assert "predicted_mouth" in EpisodeSchema.of(episode.task).by_name
     old.mkdir()
     other = as_version_2(path, old)

@@ -40,7 +40,8 @@ FOLDERS = {
     "Benchmark.py": "benchmark feeding --preset smoke --out OUT",
     "build-dataset": "build-dataset tracks --videos IN --out OUT",
     "evaluate": "evaluate --dataset IN --out OUT",
-    "train": "train residual --dataset IN --out OUT",
+    "train": "train simple_fusion --dataset IN --out OUT",
+    "fit": "fit --dataset IN --out OUT",
 }
 """Command lines that write a folder OUT; they read the folder IN, where there is one."""
 

@@ -12,7 +12,9 @@ MAX_SCRIPT_LINES = 40
 # Footage and photographs of people, and other people's model files, are not ours to publish.
 FOOTAGE = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif", ".jpg", ".jpeg", ".heic", ".webp"}
 OURS = {
-    "face_prediction/assets/residual/model.safetensors",  # docs/predictors.md says of whom
+    # docs/predictors.md says of whom
+    "face_prediction/assets/residual/model.safetensors",
+    "face_prediction/assets/residual/baselines.safetensors",
     *(  # docs/training.md says of what
         f"robo_manip_baselines/policy/shipped/{name}/model.safetensors"
         for name in ("baseline", "current", "forecast")

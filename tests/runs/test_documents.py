@@ -27,7 +27,6 @@ from face_prediction.models.settings import (
     ApproachSettings,
     CrossAttentionSettings,
     FusionSettings,
-    ResidualSettings,
 )
 from face_prediction.training.trainer import StoredTrainer
 from robo_manip_baselines.benchmark.conditions import ConditionConfig, ConditionsDocument
@@ -69,7 +68,7 @@ KINDS: dict[str, Any] = {
         *(ActConfig, ActionExecution, ApproachSettings, CheckpointDocument, CheckpointManifest),
         *(CheckpointOrigin, CheckpointRecord, ConditionConfig, ConditionsDocument, Corruption),
         *(CrossAttentionSettings, FusionSettings, ItemManifest, ManifestDocument, MetricsLine),
-        *(MlpConfig, ObservationSpec, PredictorErrorStats, ResidualSettings, SequenceSettings),
+        *(MlpConfig, ObservationSpec, PredictorErrorStats, SequenceSettings),
         *(Split, StoredErrorStats, StoredNormalization, StoredTrainer, TrainSettings),
         TrainerDocument,
     )

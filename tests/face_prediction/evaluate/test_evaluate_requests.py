@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
 import face_prediction.commands.evaluate as command
 from face_prediction.commands.cli import main
-from face_prediction.evaluation.predictors import load_network
+from face_prediction.dataset.reader import FaceDataset
+from face_prediction.evaluation.predictors import (
+    FittedPredictor,
+    load_network,
+    require_strangers,
+)
 from robo_manip_baselines.runs.errors import RequestError
 
-from .conftest import run
+from .conftest import Toy, rows_of, run
 
 pytestmark = pytest.mark.long
 
@@ -72,25 +77,54 @@ def test_a_dataset_with_one_fold_has_nobody_to_fit_to(dataset: Path, tmp_path: P
     words = ["build-dataset", root / "tracks", "--videos", root / "videos", "--folds", 1]
     words += ["--history", 8, "--future", 5, "--stride", 4, "--crop_size", 64, "--no_progress"]
     assert main([*map(str, words), "--out", str(tmp_path / "one")]) == 0
-    with pytest.raises(RequestError, match="nobody is left to fit"):
-        run(tmp_path / "one", tmp_path / "out")
+    with pytest.raises(RequestError, match=r"nobody is left to fit ar_mouth .*--baselines_from"):
+        run(tmp_path / "one", tmp_path / "out", baselines=("ar_mouth",))
+    # what has no parameters is there, and what was fitted to others
+    record = run(tmp_path / "one", tmp_path / "out", baselines=("all",), tracks=False)
+    assert set(rows_of(record)) == {"persistence", "constant_velocity", "line"}
+    assert record["notes"] == ["One fold: only baselines without parameters are fitted to it."]
+    with pytest.raises(RequestError, match="was trained on subject"):  # themselves
+        run(dataset, tmp_path / "both", baselines=("ar_mouth",), baselines_from=dataset)
 
 
-def test_a_checkpoint_of_another_dataset_is_refused(tmp_path: Path, monkeypatch) -> None:
-    learned = pytest.importorskip("face_prediction.models.learned")
+@dataclass
+class Record:
+    """What is read of a checkpoint's record."""
 
-    @dataclass
-    class Record:
-        dataset_sha256: str
+    dataset_sha256: str
+    folds: dict
+    train_subjects: tuple[str, ...] = ("ann", "zoe")
+    preset: str = "fitted"
+    settings: tuple = ()
+    training: tuple = ()
+    dataset: tuple = ()
 
-    @dataclass
-    class Loaded:
-        record: Record
 
-    monkeypatch.setattr(
-        learned.LearnedPredictor, "load", classmethod(lambda cls, folder: Loaded(Record("a" * 64)))
-    )
-    with pytest.raises(
-        RequestError, match=r"net: was trained with another dataset .*aaaa, not bbb"
-    ):
-        load_network(Path("net"), "b" * 64)
+@pytest.mark.parametrize(
+    ("digest", "tested", "found"), [("b", [1], 1), ("a", [1], None), ("b", [], None)]
+)
+def test_weights_are_for_a_fold_of_their_own_dataset_alone(
+    tmp_path: Path, monkeypatch, digest: str, tested: list[int], found: int | None
+) -> None:
+    loading = pytest.importorskip("face_prediction.models.loading")
+    pytest.importorskip("torch", reason="PyTorch is not installed (extra face-prediction)")
+    record = Record(64 * digest, {"test": tested})
+    network = Toy("net", 0, ())
+    monkeypatch.setattr(loading, "load_predictor", lambda folder: (network, record))
+    (tmp_path / "model.safetensors").write_bytes(b"")
+    fitted = load_network(tmp_path, "b" * 64)
+    assert fitted.checkpoint is not None
+    assert fitted.checkpoint["test_fold"] == found
+    assert fitted.subjects == {"ann", "zoe"}
+
+
+def test_weights_of_elsewhere_must_know_nobody(dataset: Path) -> None:
+    with FaceDataset(dataset) as opened:
+        entry = {"name": "net", "folder": "far"}
+        strangers = FittedPredictor(Toy("net", 0, ()), frozenset({"zoe"}), Path("far"), entry)
+        assert require_strangers(opened, strangers) == (
+            "net from far was trained on 1 people, of whose names none is among the 5 here."
+        )
+        known = replace(strangers, subjects=frozenset({"zoe", "bob", "ann"}))
+        with pytest.raises(RequestError, match=r"far: was trained on 2 of the 5 .* \(ann, bob\)"):
+            require_strangers(opened, known)

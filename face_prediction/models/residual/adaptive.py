@@ -1,0 +1,428 @@
+"""State of residual prediction: experts that learn from faces for as long as they are watched.
+
+Every expert starts from the coefficients of the training people. What it adds for the watched face
+is the posterior mean of a linear regression of its errors: the prior is the covariance of the
+coefficients between people, and rows count by their age and, so that a blink or a detector's slip
+teaches little, by their own error. Experts are mixed by their errors so far.
+
+Several faces are followed at once, each by itself; they are seen for the first time together.
+
+Shapes: N faces, D series, H horizons (knots, not every frame), K of them known, E experts, F
+features of one, M slow means, S signs; a last axis of 2 holds U and V. An age is a number of frames
+before the newest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from face_prediction.models.residual.experts import (
+    EXPERTS,
+    RECENT,
+    SERIES,
+    SLOW,
+    Floats,
+    LinearExpert,
+    extrapolate,
+    linear_features,
+    slow_rates,
+)
+
+ROBUST = 0.5
+"""Share of the expected error below which the errors of rows count alike."""
+OVERLAP = 0.5
+"""Errors h frames ahead overlap with their neighbours': a row counts 1 / (1 + OVERLAP (h - 1))."""
+HORIZONS = (1, 2, 3, 4, 5, 8, 12, 18, 24)
+"""Knots in frames ahead; between them the displacement is interpolated."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """Horizons that share the weights of rows, and so one matrix to be inverted.
+
+    Attributes:
+        knots: of `HORIZONS`.
+        usual: place among these of the horizon whose errors the prior is measured by.
+    """
+
+    knots: slice
+    usual: int
+
+
+BANDS = (Band(slice(0, 5), 2), Band(slice(5, 9), 6))
+"""Up to 5 frames ahead as at 3, beyond as at 12."""
+SHARPNESS = 15.0
+"""An expert whose error is 1 + d times the best one's has exp(-SHARPNESS d) times its weight."""
+MIX_MEMORY = 40.0
+"""Frames after which an error counts 1 / e in an expert's weight."""
+PRIOR_ROWS = 20.0
+"""Frames that the training people's errors count as, beside those of the watched face."""
+PACE_MEMORY = 60.0
+"""Frames after which a step counts 1 / e in the pace."""
+MOST_PACE = 6.0
+"""Times that a pace is beyond the median one, or below it, at most, where errors are told by it."""
+LEAST_PACE = 1e-4
+"""Face sides a frame: below the detector's jitter."""
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """Training people's part of a linear expert.
+
+    Attributes:
+        scale: (F,) standard deviation of the features.
+        people: (H, F, D) coefficients of scaled features.
+        precision: (2, F, F) inverse covariance of a person's coefficients about these, for each of
+            `BANDS`; None for an expert that does not adapt.
+    """
+
+    scale: Floats
+    people: Floats
+    precision: Floats | None
+
+
+@dataclass(frozen=True)
+class PeopleFit:
+    """All that is fitted to the training people, but the principal shapes and the intervals.
+
+    Attributes:
+        horizons: (H,) frames ahead.
+        linear: fits of the linear experts of `EXPERTS`, in their order.
+        usual: (E + 1, H, 2) constant and slope of the logarithm of an expert's mean error over the
+            pace of a face, by the logarithm of that pace over ``pace``; the last is the mixture.
+        pace: median mean step of the mouth, in face sides.
+    """
+
+    horizons: NDArray[np.int64]
+    linear: tuple[LinearFit, ...]
+    usual: Floats
+    pace: float
+
+    def until(self, horizon: int) -> PeopleFit:
+        """Return the part that forecasts ``horizon`` frames ahead: the first band, or both."""
+        count = BANDS[0].knots.stop if horizon <= self.horizons[BANDS[0].knots.stop - 1] else None
+        if count is None:
+            return self
+        linear = tuple(replace(fit, people=fit.people[:count]) for fit in self.linear)
+        return PeopleFit(self.horizons[:count], linear, self.usual[:, :count], self.pace)
+
+    def usual_errors(self, pace: Floats) -> Floats:
+        """Errors (N, E + 1, H) that faces with a pace (N,) make usual, in face sides."""
+        relative = np.log(np.clip(pace / self.pace, 1 / MOST_PACE, MOST_PACE))[:, None, None]
+        return np.exp(self.usual[..., 0] + self.usual[..., 1] * relative) * pace[:, None, None]
+
+
+@dataclass(frozen=True)
+class StateForecast:
+    """Forecast of N faces, as displacements from the newest frame.
+
+    Attributes:
+        moved: (N, H, D).
+        signs: (N, H, S) logarithms from which the size of the mouth's error is told, see
+            `intervals`.
+        experts: (N, E, H, D) forecasts of every expert.
+        features: (N, F) scaled, of every linear expert.
+    """
+
+    moved: Floats
+    signs: Floats
+    experts: Floats
+    features: tuple[Floats, ...]
+
+
+class FaceState:
+    """State of N faces that are followed from frame to frame.
+
+    Args:
+        fit: of the training people.
+        faces: N.
+    """
+
+    def __init__(self, fit: PeopleFit, faces: int) -> None:
+        self.fit, self.frames = fit, 0
+        knots, top = len(fit.horizons), int(fit.horizons[-1])
+        self._recent = np.zeros((faces, max(RECENT, top + 1), SERIES))
+        self._slow = np.zeros((faces, len(SLOW), SERIES))
+        self._steps = np.zeros(faces)
+        self._errors = np.zeros((faces, len(EXPERTS), knots))
+        self._mixed_errors = np.zeros((faces, knots))
+        self._late_errors = np.zeros((faces, knots))
+        self._count, self._late_count = np.zeros(knots), np.zeros(knots)
+        self._moved = Ring(top, (faces, knots, SERIES))
+        self._experts = Ring(top, (faces, len(EXPERTS), knots, 2))
+        self._bands = [band for band in BANDS if band.knots.start < knots]
+        self._learners = [
+            _Learner(expert, part, faces, self._bands, fit.horizons)
+            for expert, part in zip(_linear_experts(), fit.linear, strict=True)
+        ]
+
+    def keep(self, faces: int) -> None:
+        """Go on with the first so many faces."""
+        for name in ("_recent", "_slow", "_steps", "_errors", "_mixed_errors", "_late_errors"):
+            setattr(self, name, getattr(self, name)[:faces])
+        for part in (self._moved, self._experts, *self._learners):
+            part.keep(faces)
+
+    @property
+    def pace(self) -> Floats:
+        """Mean step (N,) of the mouth so far, in face sides a frame."""
+        memory = np.exp(-1 / PACE_MEMORY)
+        seen = (1 - memory**self.frames) / (1 - memory)
+        mean = (self._steps + PRIOR_ROWS * self.fit.pace) / (seen + PRIOR_ROWS)
+        return np.maximum(mean, LEAST_PACE)
+
+    def expected_errors(self) -> tuple[Floats, Floats]:
+        """Mean errors so far of the experts (N, E, H) and of the mixture (N, H)."""
+        seen = self._count + PRIOR_ROWS
+        usual = PRIOR_ROWS * self.fit.usual_errors(self.pace)
+        return (self._errors + usual[:, :-1]) / seen, (self._mixed_errors + usual[:, -1]) / seen
+
+    def recent(self, count: int) -> Floats:
+        """The last frames (N, count, D) taken in; before the first one the face was at rest."""
+        return self._recent[:, -count:]
+
+    def take(self, series: Floats) -> None:
+        """Take in the next frame (N, D), and learn from the forecasts that it decides."""
+        if self.frames:
+            step = np.abs(series[:, :2] - self._recent[:, -1, :2]).mean(axis=1)
+            self._steps = self._steps * np.exp(-1 / PACE_MEMORY) + step
+            self._recent = _pushed(self._recent, series)
+            self._slow += slow_rates(self.frames)[:, None] * (series[:, None] - self._slow)
+        else:
+            self._recent[:], self._slow[:] = series[:, None], series[:, None]
+        self.frames += 1
+        self._learn()
+
+    def forecast(self, recent: Floats | None = None) -> StateForecast:
+        """Forecast from the newest frame, or from other ``recent`` frames (N, W, D)."""
+        recent = self._recent[:, -RECENT:] if recent is None else recent
+        shape = (len(recent), len(EXPERTS), len(self.fit.horizons), SERIES)
+        experts = np.empty(shape)
+        features: list[Floats] = []
+        learners = iter(self._learners)
+        for number, expert in enumerate(EXPERTS):
+            if isinstance(expert, LinearExpert):
+                learner = next(learners)
+                features.append(learner.features(recent, self._slow))
+                experts[:, number] = learner.forecast(features[-1])
+            else:
+                experts[:, number] = extrapolate(expert, recent, self.fit.horizons)
+        errors, expected = self.expected_errors()
+        share = np.exp(-SHARPNESS * (errors / errors.min(axis=1, keepdims=True) - 1))
+        share /= share.sum(axis=1, keepdims=True)  # (N, E, H)
+        moved = np.einsum("neh,nehd->nhd", share, experts)
+        apart = np.abs(experts[..., :2] - moved[:, None, :, :2]).mean(axis=-1)
+        late = (self._late_errors + 3 * expected) / (self._late_count + 3)
+        speed = np.abs(np.diff(recent[:, -4:, :2], axis=1)).mean(axis=(1, 2)) + LEAST_PACE / 4
+        signs = np.log(
+            np.stack(
+                [
+                    expected,
+                    late + LEAST_PACE / 4,
+                    np.broadcast_to(speed[:, None], expected.shape),
+                    (share * apart).sum(axis=1) + LEAST_PACE / 4,
+                ],
+                axis=-1,
+            )
+        )
+        return StateForecast(moved, signs, experts, tuple(features))
+
+    def remember(self, made: StateForecast) -> None:
+        """Keep the forecast from the frame taken in last, to learn from its outcome."""
+        self._moved.push(made.moved)
+        self._experts.push(made.experts[..., :2])
+        for learner, features in zip(self._learners, made.features, strict=True):
+            learner.remember(features)
+
+    def outcomes(self) -> tuple[Floats, Floats]:
+        """Forecasts and truth (N, K, D) that the newest frame decided, of the K horizons known."""
+        ages = self.known()
+        truth = self._recent[:, -1:] - self._recent[:, -1 - ages]
+        return self._moved.of_horizons(ages), truth
+
+    def known(self) -> NDArray[np.int64]:
+        """Horizons (K,) whose forecast was made from a frame that was seen."""
+        horizons = self.fit.horizons
+        return horizons[: int(np.searchsorted(horizons, self.frames - 1, side="right"))]
+
+    def _learn(self) -> None:
+        """Learn from what the newest frame decided, of forecasts that have been remembered."""
+        ages = self.known()
+        if not len(ages):
+            return
+        moved, truth = self.outcomes()
+        known = slice(len(ages))
+        made = self._experts.of_horizons(ages, axis=1).swapaxes(1, 2)  # (N, K, E, 2)
+        errors = np.abs(made - truth[:, :, None, :2]).mean(axis=-1)
+        mixed = np.abs(moved - truth)[..., :2].mean(axis=-1)
+        memory, late = np.exp(-1 / MIX_MEMORY), np.exp(-1 / LATE_MEMORY)
+        self._errors[:, :, known] = memory * self._errors[:, :, known] + errors.swapaxes(1, 2)
+        self._mixed_errors[:, known] = memory * self._mixed_errors[:, known] + mixed
+        self._late_errors[:, known] = late * self._late_errors[:, known] + mixed
+        self._count[known] = memory * self._count[known] + 1
+        self._late_count[known] = late * self._late_count[known] + 1
+        expected = self.expected_errors()[1]
+        numbers = [n for n, expert in enumerate(EXPERTS) if isinstance(expert, LinearExpert)]
+        for number, learner in zip(numbers, self._learners, strict=True):
+            learner.learn(errors[..., number], expected, truth, ages)
+
+
+class Ring:
+    """The last rows of a series of arrays, without copying the others when one is added.
+
+    Args:
+        length: rows kept.
+        shape: of one, (N, ...).
+    """
+
+    def __init__(self, length: int, shape: tuple[int, ...]) -> None:
+        self._rows, self._count = np.zeros((length, *shape)), 0
+
+    def keep(self, faces: int) -> None:
+        """Go on with the first so many faces."""
+        self._rows = self._rows[:, :faces]
+
+    def push(self, row: Floats) -> None:
+        """Add a row (N, ...), in place of the oldest."""
+        self._rows[self._count % len(self._rows)] = row
+        self._count += 1
+
+    def row(self, age: int) -> Floats:
+        """The row (N, ...) of an age, 1 being the newest."""
+        return self._rows[(self._count - age) % len(self._rows)]
+
+    def of_horizons(self, ages: NDArray[np.int64], axis: int = 0) -> Floats:
+        """Of each row of ``ages`` (K,) its own horizon: the k-th along ``axis`` after the faces."""
+        rows = [np.take(self.row(age), k, axis=axis + 1) for k, age in enumerate(ages.tolist())]
+        return np.stack(rows, axis=axis + 1)
+
+
+class _Learner:
+    """What a linear expert has learnt from N faces.
+
+    A row is learnt from when its outcome is known, h frames later. All horizons of a band weight it
+    alike, so that their matrices are one that grows from frame to frame, seen h frames ago.
+    """
+
+    def __init__(
+        self,
+        expert: LinearExpert,
+        fit: LinearFit,
+        faces: int,
+        bands: Sequence[Band],
+        horizons: NDArray[np.int64],
+    ) -> None:
+        self.expert, self.fit, self._bands, self._horizons = expert, fit, bands, horizons
+        size, top = expert.size, int(horizons[-1])
+        self._people = fit.people.swapaxes(0, 1).reshape(size, -1)
+        self._past, self._made = (
+            Ring(top, (faces, size)),
+            Ring(top, (faces, self._people.shape[1])),
+        )
+        self._weights = [Ring(top, (faces,)) for _ in bands]
+        if fit.precision is None:
+            return
+        self._gram = np.zeros((len(bands), faces, size, size))
+        self._cross = np.zeros((len(horizons), faces, size, SERIES))
+        self._inverse: list[Ring] = []
+        for band, precision in zip(bands, fit.precision, strict=False):
+            # as they were when the first horizon of the band knew no more
+            own = horizons[band.knots]
+            inverse = Ring(int(own[-1] - own[0]) + 1, (faces, size, size))
+            for _ in range(int(own[-1] - own[0]) + 1):
+                inverse.push(np.linalg.inv(precision)[None])
+            self._inverse.append(inverse)
+
+    def keep(self, faces: int) -> None:
+        """Go on with the first so many faces."""
+        for ring in (self._past, self._made, *self._weights):
+            ring.keep(faces)
+        if self.fit.precision is not None:
+            self._gram, self._cross = self._gram[:, :faces], self._cross[:, :faces]
+            for ring in self._inverse:
+                ring.keep(faces)
+
+    def features(self, recent: Floats, slow: Floats) -> Floats:
+        """Scaled features (N, F) of recent frames (N, W, D)."""
+        return linear_features(self.expert, recent, slow) / self.fit.scale
+
+    def remember(self, features: Floats) -> None:
+        """Keep the features (N, F) of a forecast, to learn from its outcome."""
+        self._past.push(features)
+        self._made.push(features @ self._people)
+
+    def forecast(self, features: Floats) -> Floats:
+        """Displacements (N, H, D) from scaled features (N, F)."""
+        result = (features @ self._people).reshape(len(features), len(self._horizons), SERIES)
+        if self.fit.precision is None:
+            return result
+        for band, inverse in zip(self._bands, self._inverse, strict=True):
+            first = int(self._horizons[band.knots.start])
+            for place in range(band.knots.start, band.knots.stop):
+                before = inverse.row(int(self._horizons[place]) - first + 1)
+                gain = (features[:, None] @ before) @ self._cross[place]
+                result[:, place] += gain[:, 0]
+        return result
+
+    def learn(
+        self, errors: Floats, expected: Floats, truth: Floats, ages: NDArray[np.int64]
+    ) -> None:
+        """Learn from the outcomes of K horizons.
+
+        Args:
+            errors: (N, K) of this expert.
+            expected: (N, H) errors of the mixture.
+            truth: (N, K, D) displacements.
+            ages: (K,) of the forecasts, the first K horizons.
+        """
+        if self.fit.precision is None:
+            return
+        memory = np.exp(-1 / self.expert.memory)
+        for number, band in enumerate(self._bands):
+            first, stop = band.knots.start, min(band.knots.stop, len(ages))
+            if first >= stop:
+                break
+            horizon = int(self._horizons[band.usual])
+            row = self._past.row(int(ages[first]))
+            ratio = errors[:, first] / expected[:, first]
+            self._weights[number].push(row_weights(ratio, expected[:, band.usual], horizon))
+            weighted = self._weights[number].row(1)[:, None] * row
+            gram = self._gram[number]
+            gram *= memory
+            gram += weighted[..., None] * row[:, None]
+            self._inverse[number].push(np.linalg.inv(gram + self.fit.precision[number]))
+            for place in range(first, stop):
+                age = int(ages[place])
+                people = self._made.row(age)[:, place * SERIES : (place + 1) * SERIES]
+                missed = truth[:, place] - people
+                weight = self._weights[number].row(age - int(ages[first]) + 1)
+                cross = self._cross[place]
+                cross *= memory
+                cross += (weight[:, None] * self._past.row(age))[..., None] * missed[:, None]
+
+
+LATE_MEMORY = 8.0
+"""Frames after which an error counts 1 / e among the late ones, from which intervals are told."""
+
+
+def row_weights(ratio: Floats, usual: Floats, horizon: int) -> Floats:
+    """Weights (...) of rows whose error is ``ratio`` (...) times what was expected.
+
+    Those of a Laplace density whose mean is ``usual`` (...) at ``horizon``, in the least-squares
+    form of iterative reweighting; less for errors that overlap with their neighbours'.
+    """
+    overlap = 1 + OVERLAP * (horizon - 1)
+    return 1 / (overlap * usual**2 * np.sqrt(ratio**2 + ROBUST**2))
+
+
+def _linear_experts() -> list[LinearExpert]:
+    return [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
+
+
+def _pushed(past: Floats, newest: Floats) -> Floats:
+    """The rows (N, T, ...) without the oldest, and with the newest (N, ...)."""
+    return np.concatenate([past[:, 1:], newest[:, None]], axis=1)

@@ -1,0 +1,305 @@
+"""Fit of residual prediction to the tracks of training people.
+
+Coefficients are those of the least absolute error, whose sum over all frames is what predictors are
+compared by. The spread of a person's own coefficients about them, by expectation maximisation, is
+the prior that a face's own frames have to overcome.
+
+Shapes: N rows (frames of all tracks), P people, D series, H horizons, F features of an expert.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from face_prediction.forecast.autoregression import principal_shapes
+from face_prediction.forecast.interface import subject_folds
+from face_prediction.models.residual.adaptive import (
+    BANDS,
+    HORIZONS,
+    LEAST_PACE,
+    MOST_PACE,
+    LinearFit,
+    PeopleFit,
+    row_weights,
+)
+from face_prediction.models.residual.experts import (
+    EXPERTS,
+    SHAPES,
+    Floats,
+    LinearExpert,
+    linear_features,
+    recent_frames,
+    slow_means,
+)
+from face_prediction.models.residual.intervals import (
+    LEVELS,
+    SIGNS,
+    IntervalFit,
+    measure_intervals,
+)
+from face_prediction.models.residual.predictor import (
+    ResidualFit,
+    face_series,
+    face_side,
+    follow_tracks,
+)
+from robo_manip_baselines.runs.errors import RequestError
+
+_RIDGE = 3e-3  # share of the features' mean square added to the diagonal
+_ROUNDS = 4  # of reweighting from least squares to least absolute error
+_SMALL_ERROR = 1e-3  # face sides: errors below it count alike, of calm experts a tenth
+_STILL = 1e-3  # face sides: a track with this mean step of the mouth counts half
+_STRIDE = 2  # frames between rows that are fitted to: neighbours are alike
+_WARM_UP = 10  # frames at the beginning of a track that are left out: they have no past
+_EM_ROUNDS = 10
+_FIRST_SPREAD = 0.05  # of coefficients of scaled features, where the maximisation begins
+_LEAST_SPREAD = 1e-3  # share of the mean variance added to every one
+_MEASURED = 500  # frames at the beginning of a track that errors are measured on
+_LEAST_ROWS = 30  # of a person, for a part in the spread
+
+
+@dataclass(frozen=True)
+class Rows:
+    """All frames of the training tracks, one after another.
+
+    Attributes:
+        series: (N, D).
+        recent: (N, W, D).
+        slow: (N, M, D).
+        person: (N,) number of the person.
+        seen: (N,) frames before this one in its track.
+        left: (N,) frames after it.
+        pace: (N,) mean step of the mouth in its track.
+    """
+
+    series: Floats
+    recent: Floats
+    slow: Floats
+    person: NDArray[np.int64]
+    seen: NDArray[np.int64]
+    left: NDArray[np.int64]
+    pace: Floats
+
+    @classmethod
+    def of(cls, tracks: Sequence[Floats], subjects: Sequence[str]) -> Rows:
+        """Put tracks (T, D) one after another."""
+        lengths = [len(track) for track in tracks]
+        people = np.unique(np.asarray(subjects), return_inverse=True)[1]
+        paces = [np.abs(np.diff(track[:, :2], axis=0)).mean() for track in tracks]
+        numbers = np.repeat(np.arange(len(tracks)), lengths)
+        return cls(
+            series=np.concatenate(tracks),
+            recent=np.concatenate([recent_frames(track) for track in tracks]),
+            slow=np.concatenate([slow_means(track) for track in tracks]),
+            person=people[numbers],
+            seen=np.concatenate([np.arange(n) for n in lengths]),
+            left=np.concatenate([np.arange(n)[::-1] for n in lengths]),
+            pace=np.maximum(np.array(paces), LEAST_PACE)[numbers],
+        )
+
+    def origins(self, horizon: int) -> NDArray[np.int64]:
+        """Rows with a past, and ``horizon`` frames after them."""
+        is_fitted = (self.seen >= _WARM_UP) & (self.seen % _STRIDE == 0)
+        return np.flatnonzero(is_fitted & (self.left >= horizon))
+
+
+def fit_people(tracks: Sequence[Floats], subjects: Sequence[str]) -> PeopleFit:
+    """Fit every linear expert to tracks (T, D) of people.
+
+    All errors count as alike: `fit_residual` measures them.
+    """
+    rows, knots = Rows.of(tracks, subjects), np.array(HORIZONS)
+    experts = [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
+    linear = tuple(fit_linear(expert, rows, knots) for expert in experts)
+    growth = np.log(np.tile(knots.astype(np.float64), (len(EXPERTS) + 1, 1)))
+    usual = np.stack([growth, np.zeros_like(growth)], axis=-1)
+    return PeopleFit(knots, linear, usual, float(np.median(rows.pace[rows.seen == 0])))
+
+
+def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) -> LinearFit:
+    """Fit one linear expert: scale, people's coefficients, and spread between people."""
+    features = linear_features(expert, rows.recent, rows.slow)
+    scale = features.std(axis=0) + 1e-9
+    features = features / scale
+    size, count = expert.size, len(horizons)
+    people = np.empty((count, size, rows.series.shape[1]))
+    usual = [band.usual for band in BANDS]
+    precision = np.empty((len(BANDS), size, size))
+    for place, horizon in enumerate(horizons.tolist()):
+        origins = rows.origins(horizon)
+        x = features[origins]
+        y = rows.series[origins + horizon] - rows.series[origins]
+        pace = rows.pace[origins]
+        weight = 1 / pace if expert.calm else pace / (pace + _STILL)
+        people[place] = least_absolute(x, y, weight, _SMALL_ERROR / (10 if expert.calm else 1))
+        if expert.adapts and place in usual:
+            missed = (y - x @ people[place])[:, :2]
+            precision[usual.index(place)] = spread(
+                x, missed, rows.person[origins], horizon, expert.memory
+            )
+    return LinearFit(scale, people, precision if expert.adapts else None)
+
+
+def least_absolute(x: Floats, y: Floats, weight: Floats, small: float) -> Floats:
+    """Coefficients (F, D) of the least absolute error of y's first two columns, the mouth.
+
+    Errors below ``small`` count alike.
+    """
+    used = weight
+    solution = np.zeros((x.shape[1], y.shape[1]))
+    for iteration in range(_ROUNDS):
+        if iteration:
+            error = np.abs(y[:, :2] - x @ solution[:, :2]).mean(axis=1)
+            used = weight / np.sqrt(error**2 + small**2)
+            used = used / used.mean()
+        weighted = x * used[:, None]
+        gram = weighted.T @ x + _RIDGE * len(x) * np.eye(x.shape[1])
+        solution = np.linalg.solve(gram, weighted.T @ y)
+    return solution
+
+
+def spread(
+    x: Floats, missed: Floats, person: NDArray[np.int64], horizon: int, memory: float
+) -> Floats:
+    """Inverse covariance (F, F) between people of what corrects errors (N, 2) on features (N, F).
+
+    Expectation maximisation of a hierarchical linear model. A person's rows count together as many
+    as a face's that has been watched for ``memory`` frames, weighted as `row_weights` does.
+    """
+    grams: list[Floats] = []
+    crosses: list[Floats] = []
+    for number in np.unique(person):
+        own = np.flatnonzero(person == number)
+        if len(own) < _LEAST_ROWS:
+            continue
+        error = np.abs(missed[own]).mean(axis=1)
+        expected = max(float(error.mean()), LEAST_PACE)
+        weight = row_weights(error / expected, np.full(len(own), expected), horizon)
+        weighted = x[own] * weight[:, None] * min(_STRIDE, memory / len(own))
+        grams.append(weighted.T @ x[own])
+        crosses.append(weighted.T @ missed[own])
+    size = x.shape[1]
+    covariance = _FIRST_SPREAD * np.eye(size)
+    gram, cross = np.array(grams), np.array(crosses)
+    for _ in range(_EM_ROUNDS if grams else 0):
+        posterior = np.linalg.inv(gram + np.linalg.inv(covariance))
+        mean = posterior @ cross
+        covariance = (np.einsum("pfa,pga->fg", mean, mean) / 2 + posterior.sum(axis=0)) / len(gram)
+        covariance += _LEAST_SPREAD * np.trace(covariance) / size * np.eye(size)
+    return np.linalg.inv(covariance)
+
+
+def fit_residual(tracks: Sequence[NDArray[np.floating]], subjects: Sequence[str]) -> ResidualFit:
+    """Fit everything to tracks (T, L, 2) of people, in any units of their own.
+
+    Intervals are measured on people that the coefficients were not fitted to: each half of the
+    people by a fit to the other half.
+
+    Raises:
+        RequestError: there are fewer than two people, or their tracks are too short.
+    """
+    names = sorted(set(subjects))
+    if len(names) < 2 or max(map(len, tracks), default=0) <= _WARM_UP + 2 * HORIZONS[-1]:
+        needed = f"2 or more with tracks of more than {_WARM_UP + 2 * HORIZONS[-1]} frames"
+        raise RequestError(f"tracks of {len(names)} people; residual needs {needed}")
+    shown = [track / face_side(track[0]) for track in tracks]
+    basis = shapes_of(shown)
+    series = [face_series(track, basis) for track in shown]
+    people = fit_people(series, subjects)
+    half = subject_folds(subjects, 2)
+    blank = IntervalFit(
+        np.zeros((len(HORIZONS), 2, SIGNS + 1)), np.zeros((len(HORIZONS), 2, len(LEVELS)))
+    )
+    trials: list[Trial] = []
+    for part in range(2):
+        own, others = (np.flatnonzero((half == part) == same).tolist() for same in (True, False))
+        fit = fit_people([series[i] for i in others], [subjects[i] for i in others])
+        fit = replace(fit, usual=people.usual, pace=people.pace)
+        shown_part = [series[i][:_MEASURED] for i in own]
+        trials.append(trial(ResidualFit(basis, fit, blank), shown_part))
+    usual = usual_errors(trials, people.pace)
+    signs, errors = (np.concatenate([getattr(t, n) for t in trials]) for n in ("signs", "errors"))
+    return ResidualFit(basis, replace(people, usual=usual), measure_intervals(signs, errors))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Forecasts of people that the coefficients were not fitted to, N frames of all tracks.
+
+    Attributes:
+        signs: (N, H, S), see `intervals`.
+        errors: (N, H, 2) of the mixture; NaN where the track had ended.
+        sizes: (N, E + 1, H) absolute errors of the experts and, last, of the mixture, both axes'
+            mean.
+        track: (N,) number of the track.
+        pace: (N,) mean step of the mouth in the track.
+    """
+
+    signs: Floats
+    errors: Floats
+    sizes: Floats
+    track: NDArray[np.int64]
+    pace: Floats
+
+
+def trial(fit: ResidualFit, tracks: Sequence[Floats]) -> Trial:
+    """Forecast tracks (T, D) from every frame."""
+    knots = fit.people.horizons
+    signs = [np.full((len(track), len(knots), SIGNS), np.nan) for track in tracks]
+    count = len(EXPERTS) + 1
+    moved = [np.full((len(track), count, len(knots), 2), np.nan) for track in tracks]
+    for frame, numbers, _, forecast in follow_tracks(fit, tracks, HORIZONS[-1]):
+        for place, number in enumerate(numbers):
+            signs[number][frame] = forecast.signs[place]
+            moved[number][frame, :-1] = forecast.experts[place, ..., :2]
+            moved[number][frame, -1] = forecast.moved[place, :, :2]
+    for track, made in zip(tracks, moved, strict=True):
+        for place, horizon in enumerate(knots.tolist()):
+            last = max(len(track) - horizon, 0)
+            made[:last, :, place] -= (track[horizon:, :2] - track[:last, :2])[:, None]
+            made[last:, :, place] = np.nan
+        made[:_WARM_UP] = np.nan
+    joined = np.concatenate(moved)
+    lengths = [len(track) for track in tracks]
+    paces = [max(float(np.abs(np.diff(t[:, :2], axis=0)).mean()), LEAST_PACE) for t in tracks]
+    return Trial(
+        np.concatenate(signs),
+        joined[:, -1],
+        np.abs(joined).mean(axis=-1),
+        np.repeat(np.arange(len(tracks)), lengths),
+        np.repeat(paces, lengths),
+    )
+
+
+def usual_errors(trials: Sequence[Trial], pace: float) -> Floats:
+    """`PeopleFit.usual`: the line through the mean errors of tracks, by their pace."""
+    shape = trials[0].sizes.shape[1:]
+    relative: list[Floats] = []
+    paces: list[float] = []
+    for made in trials:
+        for number in np.unique(made.track):
+            own = made.track == number
+            sizes = made.sizes[own]
+            if np.isfinite(sizes).any(axis=0).all():
+                own_pace = float(made.pace[own][0])
+                paces.append(own_pace)
+                relative.append(np.log(np.nanmean(sizes, axis=0) / own_pace + 1e-9))
+    ratio = np.log(np.clip(np.array(paces) / pace, 1 / MOST_PACE, MOST_PACE))
+    rows = np.stack([np.ones_like(ratio), ratio], axis=1)
+    solution = np.linalg.lstsq(rows, np.array(relative).reshape(len(ratio), -1), rcond=None)[0]
+    return solution.T.reshape(*shape, 2)
+
+
+def shapes_of(tracks: Sequence[NDArray[np.floating]]) -> Floats:
+    """Principal shapes (K, 2 L) of tracks (T, L, 2), about the mean of every 75 frames or so."""
+    length = min(75, *map(len, tracks))
+    pieces = [
+        track[first : first + length]
+        for track in tracks
+        for first in range(0, len(track) - length + 1, length)
+    ]
+    return principal_shapes(np.stack(pieces), SHAPES)
