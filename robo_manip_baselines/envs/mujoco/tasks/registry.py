@@ -23,7 +23,10 @@ from robo_manip_baselines.runs.errors import RequestError, require_choice
 
 NAMESPACE = "robo_manip_baselines"
 
-TASKS = {"FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY"}
+TASKS = {
+    "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
+    "FaceWipingEnv": "robo_manip_baselines.envs.mujoco.tasks.wiping:ENTRY",
+}
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
 
 

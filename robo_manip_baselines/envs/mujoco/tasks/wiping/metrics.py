@@ -1,0 +1,58 @@
+"""Metrics of a wiping episode from its ``info``, and the kind of failure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.tasks.contact_metrics import ForceTimes
+from robo_manip_baselines.envs.mujoco.tasks.wiping.success import FORCE_HIGH, FORCE_LOW
+
+
+class WipingMetrics:
+    """Wiped share and contact force of one episode; see `EpisodeMetrics`."""
+
+    def __init__(self) -> None:
+        self._forces = ForceTimes()
+        self._below = self._within = self._above = 0
+        self._sum = 0.0
+
+    def update(self, info: Mapping[str, Any]) -> None:
+        """Take in the ``info`` of a step."""
+        self._forces.update(float(info["face_force"]))
+        force = float(info["pad_force"])
+        self._sum += force
+        self._below += 0.0 < force < FORCE_LOW
+        self._within += FORCE_LOW <= force <= FORCE_HIGH
+        self._above += force > FORCE_HIGH
+
+    def result(self, info: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+        """Return the kind of failure and the columns of the result row."""
+        steps = self._below + self._within + self._above
+        kind = failure_kind(bool(info["is_success"]), self._below, self._within, self._above)
+        return kind, {
+            "wiped_share": float(info["wiped_share"]),
+            "pad_force_mean": self._sum / steps if steps else None,
+            # Microseconds hide what floating point adds to sums of control periods.
+            "contact_time": round(steps * CONTROL_PERIOD, 6),
+            "range_share": self._within / steps if steps else None,
+            **self._forces.columns(CONTROL_PERIOD),
+        }
+
+
+def failure_kind(is_success: bool, below: int, within: int, above: int) -> str:
+    """Return the kind of failure of an episode; ``""`` for a success.
+
+    Args:
+        is_success: as in ``info``.
+        below, within, above: control steps in contact with a force below, within and above the
+            range in which the pad wipes.
+    """
+    if is_success:
+        return ""
+    if below + within + above == 0:
+        return "no_contact"
+    if within >= below + above:
+        return "missed"
+    return "too_hard" if above > below else "too_light"
