@@ -8,9 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, MOUTH_BASE
 from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS
-from robo_manip_baselines.envs.mujoco.face import REST_OPENING
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.envs.mujoco.tasks.wiping import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.wiping.model import (
@@ -138,11 +136,12 @@ class FaceWipingEnv(FaceEnv):
     def head_pose(self, ahead: float = 0.0) -> tuple[Floats, Floats]:
         """Position (3,) m and orientation (4,) wxyz of ``face/head`` in the world, ``ahead`` s on.
 
-        It is what `landmark_track` is made from.
+        After the end of the recording the head stands still.
         """
-        displacement, orientation, jaw = self.segment.at(self._row() * CONTROL_PERIOD + ahead)
-        mouth = MOUTH_BASE + self.face_offset + displacement
-        return self.face.body_poses(mouth, orientation, jaw + REST_OPENING)["face/head"]
+        position, orientation = self.replay.bodies["face/head"]
+        step = self._row() * self.substeps + round(ahead / self.model.opt.timestep)
+        row = min(step, len(position) - 1)
+        return position[row], orientation[row]
 
     def _from_head(self, point: Floats) -> Floats:
         """Return a point (3,) m of the world in the frame of ``face/head``."""

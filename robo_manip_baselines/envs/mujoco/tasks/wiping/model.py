@@ -29,7 +29,7 @@ PATCH_DEPTH = 0.03
 
 CENTER_FROM_MOUTH = (-0.036, 0.036)
 """m across and up, from the mouth to the middle of the residue: on the cheek beside the nostril,
-40 mm below the eye, where no muscle of the mouth moves the skin much."""
+40 mm below the eye, where an opening jaw hardly moves the skin."""
 
 HALF_SIDE = 0.0127
 """m, half the side of the square with residue: a square inch, as King et al. (IROS 2010) put on the
@@ -43,19 +43,19 @@ SPOTS = ROWS**2
 PAD_RADIUS = 0.015
 """m, a cotton ball wrapped in cloth, as used to wash faces."""
 
-PAD_FORWARD = 0.085
+PAD_FORWARD = 0.095
 """m from the site ``right/gripper`` to the pad's centre, along the gripper: long enough that the
 fingers stay clear of the nose while the pad is beside it."""
 
-PAD_STROKE = 0.012
-"""m by which the foam under the cloth can be pressed: 60 % of a thickness of 20 mm, where open-cell
-foam begins to be solid."""
+PAD_STROKE = 0.020
+"""m by which the foam behind the cloth can be pressed: two thirds of a thickness of 30 mm, where
+open-cell foam has become solid."""
 
-PAD_STIFFNESS = 250.0
-"""N/m along the gripper: soft upholstery foam yields 40 % (8 mm of 20) under about 4 kPa (the
-compression stress of ISO 3386-1), over the 5 cm² that the pad touches 2 N."""
+PAD_STIFFNESS = 200.0
+"""N/m along the gripper: soft upholstery foam yields 40 % (12 mm of 30) under about 5 kPa (the
+compression stress of ISO 3386-1), over the 5 cm² of the pad 2.4 N."""
 
-PAD_DAMPING = 3.0
+PAD_DAMPING = 2.8
 """N s/m, 0.7 of critical for the pad's mass."""
 
 PAD_MASS = 0.02
@@ -71,7 +71,7 @@ _FRICTION = (0.3, 0.005, 0.0001)  # that of the face: moist cloth slides on wet 
 
 _SPOT_SIZE = (0.0030, 0.0030, 0.0012)
 _SPOT_COLOUR = (0.62, 0.16, 0.05, 1.0)
-_PLASTIC, _CLOTH = (0.93, 0.93, 0.90, 1.0), (0.45, 0.72, 0.86, 1.0)
+_PLASTIC, _FOAM, _CLOTH = (0.93, 0.93, 0.9, 1.0), (0.95, 0.86, 0.5, 1.0), (0.45, 0.72, 0.86, 1.0)
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def add_pad(scene: mujoco.MjSpec) -> None:
     box, capsule = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
     grip = (0.022, HANDLE_FINGER - 0.021, 0.011)
     link.add_geom(type=box, size=grip, pos=(site, 0, 0), **untouchable)
-    stem = [site + grip[0], 0, 0, end - PAD_STROKE - 0.008, 0, 0]
+    stem = [site + grip[0], 0, 0, end - PAD_STROKE - 0.012, 0, 0]
     link.add_geom(type=capsule, size=(0.005, 0, 0), fromto=stem, **untouchable)
     pad = link.add_body(name="wiping/pad", pos=(end, 0, 0), gravcomp=1)
     pad.add_joint(
@@ -206,6 +206,10 @@ def add_pad(scene: mujoco.MjSpec) -> None:
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         stiffness=PAD_STIFFNESS,
         damping=PAD_DAMPING,
+    )
+    foam = [-0.006, 0, 0, -PAD_STROKE - 0.008, 0, 0]
+    pad.add_geom(
+        type=capsule, size=(0.008, 0, 0), fromto=foam, **{**untouchable, "rgba": _FOAM}
     )
     pad.add_geom(
         name="wiping/pad",

@@ -20,7 +20,7 @@ which a touch is a push."""
 
 WIPE_RADIUS = 0.010
 """m around the point of contact within which the pad wipes. A ball of radius 15 mm that is flattened
-by 2 to 10 mm (1 to 3 N) touches a disc of radius sqrt(2 r d - d²), 7 to 14 mm."""
+by 2 mm and more touches a disc of radius sqrt(2 r d - d²), 7 mm and more."""
 
 WIPED_SHARE = 0.8
 """Share of the residue that is to be wiped off."""
