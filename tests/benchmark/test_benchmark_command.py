@@ -288,6 +288,7 @@ def test_the_conditions_ship_with_the_package() -> None:
         "demo.yaml",
         "feeding.yaml",
         "foresight_policies.yaml",
+        "wiping.yaml",
     }
 
 

@@ -46,8 +46,9 @@ def failure_kind(is_success: bool, below: int, within: int, above: int) -> str:
 
     Args:
         is_success: as in ``info``.
-        below, within, above: control steps in contact with a force below, within and above the
-            range in which the pad wipes.
+        below: control steps in contact with less force than the pad wipes with.
+        within: those with a force in the range.
+        above: those with more.
     """
     if is_success:
         return ""

@@ -19,10 +19,10 @@ from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel
 
 Floats = NDArray[np.float64]
 
-PATCH = (123, 50, 101, 36, 205, 203, 206, 147, 187, 207, 216, 92, 100, 117, 118)
+PATCH = (123, 50, 101, 36, 205, 203, 206, 147, 213, 187, 207, 216, 92, 100, 117, 118)
 """Landmarks of the right cheek, from the nose to the cheekbone. Their convex hull is what the pad
 touches: it is within 1.2 mm of the surface under the residue, where the face's own geoms, some
-ellipsoids, lie 4 to 40 mm below it. Landmarks 207, 216 and 187 follow the jaw by 7 to 10 %."""
+ellipsoids, lie 4 to 40 mm below it. Landmarks 187, 207, 213 and 216 follow the jaw, by 7 to 10 %."""
 
 PATCH_DEPTH = 0.03
 """m, thickness of the hull: more than a pad ever sinks in."""
@@ -208,9 +208,7 @@ def add_pad(scene: mujoco.MjSpec) -> None:
         damping=PAD_DAMPING,
     )
     foam = [-0.006, 0, 0, -PAD_STROKE - 0.008, 0, 0]
-    pad.add_geom(
-        type=capsule, size=(0.008, 0, 0), fromto=foam, **{**untouchable, "rgba": _FOAM}
-    )
+    pad.add_geom(type=capsule, size=(0.008, 0, 0), fromto=foam, **{**untouchable, "rgba": _FOAM})
     pad.add_geom(
         name="wiping/pad",
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
