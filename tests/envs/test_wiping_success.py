@@ -54,7 +54,7 @@ def test_it_wipes_near_the_point_of_contact_and_nowhere_without() -> None:
 def test_an_eye_is_touched_near_the_middle_of_its_lids(away: float, expected: bool) -> None:
     eyes = np.array([[0.03, 0.032, 0.03], [0.03, -0.032, 0.03]])
     for eye in eyes:
-        assert is_on_eye(eye + [0.0, 0.0, -away], eyes) is expected
+        assert is_on_eye(eye - np.array([0.0, 0.0, away]), eyes) is expected
 
 
 STEP = StepMeasurements(

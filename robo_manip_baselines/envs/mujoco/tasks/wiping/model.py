@@ -22,7 +22,8 @@ Floats = NDArray[np.float64]
 PATCH = (123, 50, 101, 36, 205, 203, 206, 147, 213, 187, 207, 216, 92, 100, 117, 118)
 """Landmarks of the right cheek, from the nose to the cheekbone. Their convex hull is what the pad
 touches: it is within 1.2 mm of the surface under the residue, where the face's own geoms, some
-ellipsoids, lie 4 to 40 mm below it. Landmarks 187, 207, 213 and 216 follow the jaw, by 7 to 10 %."""
+ellipsoids, lie 4 to 40 mm below it. Landmarks 187, 207, 213 and 216 follow the jaw by 7 to 10 %,
+the hull does not."""
 
 PATCH_DEPTH = 0.03
 """m, thickness of the hull: more than a pad ever sinks in."""

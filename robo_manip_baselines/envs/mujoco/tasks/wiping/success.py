@@ -19,8 +19,8 @@ PUSH_FORCE = 10.0
 which a touch is a push."""
 
 WIPE_RADIUS = 0.010
-"""m around the point of contact within which the pad wipes. A ball of radius 15 mm that is flattened
-by 2 mm and more touches a disc of radius sqrt(2 r d - d²), 7 mm and more."""
+"""m around the point of contact within which the pad wipes. A ball of radius 15 mm that is
+flattened by 2 mm and more touches a disc of radius sqrt(2 r d - d²), 7 mm and more."""
 
 WIPED_SHARE = 0.8
 """Share of the residue that is to be wiped off."""
