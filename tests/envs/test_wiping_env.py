@@ -220,7 +220,9 @@ def test_the_experts_wipe(world: FaceWipingEnv, name: str) -> None:
     expert.reset()
     terminated, rewards, forces = False, 0.0, []
     while not terminated and world.time < 12.0:
-        _, reward, terminated, _, info = world.step(expert.act())
+        action = expert.act()
+        assert action[-1] == np.float32(HANDLE_FINGER)
+        _, reward, terminated, _, info = world.step(action)
         rewards += reward
         forces.append(info["pad_force"])
     assert info["is_success"]
