@@ -34,8 +34,8 @@ FORCE = 2.0
 """N, aimed at: the middle of the range in which the pad wipes."""
 
 COMPLIANCE = 0.02
-"""m/s by which the pad is advanced for every newton that is missing. The foam yields 5 mm/N, so that
-an error is halved in 0.17 s: slower than the arm's own lag (0.1 s), or the two would swing."""
+"""m/s by which the pad is advanced for every newton that is missing. The foam yields 5 mm/N, so
+that an error is halved in 0.17 s: slower than the arm's own lag (0.1 s), or both would swing."""
 
 DEPTH = (-0.015, 0.015)
 """m between which the regulation may advance the pad."""

@@ -26,8 +26,8 @@ WIPED_SHARE = 0.8
 """Share of the residue that is to be wiped off."""
 
 RANGE_SHARE = 0.7
-"""Share of the time in contact that the force is to be within the range. Coming and going cross 0 to
-1 N, a twentieth of the expert's contact; the rest is left to a face that moves suddenly."""
+"""Share of the time in contact that the force is to be within the range. Coming and going cross
+0 to 1 N, a twentieth of the expert's contact; the rest is left to faces that move suddenly."""
 
 EYE_RADIUS = 0.020
 """m around the middle of the lids within which the robot touches the eye: half the width of the
