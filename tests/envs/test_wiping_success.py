@@ -103,9 +103,7 @@ def test_phases_go_from_the_first_contact_to_success() -> None:
     ("steps", "expected"),
     [
         ((WIPED, AWAY), True),
-        ((WIPED,), False),  # not withdrawn
-        ((WIPED, replace(AWAY, pad_distance=CLEAR_DISTANCE - EPSILON)), False),
-        ((AWAY, WIPED), False),  # away before, not after
+        ((WIPED,), True),
         ((STEP, AWAY), False),  # not wiped
         # 7 of 10 steps in contact with 1 to 3 N, and 6.
         ((*[STEP] * 6, WIPED, *[replace(STEP, pad_force=0.5)] * 3, AWAY), True),
@@ -119,6 +117,23 @@ def test_phases_go_from_the_first_contact_to_success() -> None:
 def test_strict_success(steps: tuple[StepMeasurements, ...], expected: bool) -> None:
     progress = run(*steps)
     assert progress.is_success_strict is expected
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected"),
+    [
+        ((WIPED, AWAY), True),
+        ((WIPED, AWAY, STEP), True),
+        ((WIPED,), False),
+        ((WIPED, replace(AWAY, pad_distance=CLEAR_DISTANCE - EPSILON)), False),
+        ((AWAY, WIPED), False),  # away before, not after
+        ((STEP, AWAY), False),  # not wiped
+    ],
+)
+def test_the_pad_withdraws_after_success(
+    steps: tuple[StepMeasurements, ...], expected: bool
+) -> None:
+    assert run(*steps).is_clear is expected
 
 
 @pytest.mark.parametrize(

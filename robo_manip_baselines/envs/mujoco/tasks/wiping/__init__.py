@@ -67,6 +67,6 @@ ENTRY = TaskEntry(
         *FORCE_COLUMNS,
     ),
     success="80 % of the residue was wiped off with 1 to 3 N",
-    strict_success="1 to 3 N in at least 70 % of the contact, never more than 10 N, no eye "
-    "touched, and the pad withdrawn",
+    strict_success="and 1 to 3 N in at least 70 % of the contact, never more than 10 N, and no eye "
+    "touched, until the end",
 )

@@ -76,9 +76,9 @@ class FaceWipingEnv(FaceEnv):
     | key | type | content |
     |---|---|---|
     | ``is_success`` | bool | at least 80 % of the spots are wiped off |
-    | ``is_success_strict`` | bool | ``is_success``, and the pad has withdrawn by 0.08 m; and until
-    then the force was 1 to 3 N in at least 70 % of the time in contact and never more than 10 N,
-    and the robot has not touched an eye (0.020 m around the middle of the lids) |
+    | ``is_success_strict`` | bool | ``is_success``, and so far the force was 1 to 3 N in at least
+    70 % of the time in contact and never more than 10 N, and the robot has not touched an eye
+    (0.020 m around the middle of the lids) |
     | ``completion_time`` | float or None | s from the start to ``is_success``; None before |
     | ``phase`` | str | approach, wipe (from the first contact) or finish (after ``is_success``) |
     | ``wiped_share`` | float | share of the spots that are wiped off |

@@ -141,10 +141,9 @@ class WipingProgress:
 
     @property
     def is_success_strict(self) -> bool:
-        """It was wiped lightly, never pushing, no eye was touched, and the pad is withdrawn."""
+        """It was wiped off, and so far lightly, never pushing, and no eye was touched."""
         return (
             self.is_success
-            and self.is_clear
             and self.range_share >= RANGE_SHARE
             and self.largest_force <= PUSH_FORCE
             and not self.touched_eye
