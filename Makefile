@@ -15,7 +15,7 @@ ifeq ($(shell uname),Linux)
 export MUJOCO_GL ?= egl
 endif
 
-.PHONY: help demo smoke test test-fast test-slow check format setup opengl wheelhouse clean
+.PHONY: help demo smoke test test-fast test-slow check docs format setup opengl wheelhouse clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -47,6 +47,12 @@ check: setup ## format, lint, types
 	$(BIN)/ruff check
 	$(BIN)/pyright
 
+docs: export NO_MKDOCS_2_WARNING=1
+docs: setup ## the documentation as a site in site/, every link checked; opens without a network
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m mkdocs build --strict
+	@echo "Start page: site/start.html"
+
 format: setup ## format the code and fix what the linter can
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
@@ -63,5 +69,5 @@ wheelhouse: ## all wheels for a machine without network: make wheelhouse PYTHON=
 	$(BIN)/python .ci/wheelhouse.py --python "$(or $(PYTHON),3.12)" $(if $(filter 1,$(WITH_TORCH)),--with_torch)
 
 clean: ## remove what the other targets made, datasets excepted
-	rm -rf .venv wheelhouse build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv wheelhouse build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

@@ -122,8 +122,8 @@ def make_action_buffer(
 
 INFERENCE_PRECISIONS = ("fp32", "bf16")
 
-CUDA_TILE = 8
-"""Rows of a tile on a GPU, where eight cost little more than one."""
+TILE = 8
+"""Rows of a tile where eight cost little more than one: on a GPU, and without images on a CPU."""
 
 
 class PolicyRunner:
@@ -131,7 +131,8 @@ class PolicyRunner:
 
     The network always runs on tiles of the same number of rows, the last one filled up with zeros:
     matrix products of other shapes are rounded otherwise, and an episode would come out differently
-    for the number of environments beside it. On a CPU a tile is one row, which costs nothing there.
+    for the number of environments beside it. With images on a CPU a tile is one row, which costs
+    nothing there.
 
     Args:
         model: the network; it is moved to the device and put into evaluation mode.
@@ -141,7 +142,7 @@ class PolicyRunner:
         num_envs: n.
         device: of the network.
         precision: ``fp32``, or ``bf16`` for the products inside the network.
-        tile: rows of a tile; 1 on a CPU and ``CUDA_TILE`` elsewhere if None.
+        tile: rows of a tile; ``TILE`` if None, and 1 with images on a CPU.
 
     Raises:
         RequestError: a value that is not valid.
@@ -176,7 +177,7 @@ class PolicyRunner:
         self._images = np.zeros((num_envs, *image_shape), np.uint8)
         self._seeds = np.zeros(num_envs, np.int64)
         self._steps = np.zeros(num_envs, np.int64)
-        rows = tile or (1 if self._device.type == "cpu" else CUDA_TILE)
+        rows = tile or (1 if self._device.type == "cpu" and spec.cameras else TILE)
         # The same memory for every tile: pinned, so that a GPU can fetch it by itself.
         pinned = self._device.type == "cuda"
         self._state_tile = torch.zeros(rows, steps, state_size, pin_memory=pinned)

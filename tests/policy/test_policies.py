@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from robo_manip_baselines.data.normalization import METHODS
+from robo_manip_baselines.policy.execution import TILE
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel
 from robo_manip_baselines.policy.registry import (
     load_part,
@@ -114,6 +115,25 @@ def test_a_row_does_not_depend_on_the_others(policy: str) -> None:
     )
     # Matrix products of other shapes add up in another order: a few float32 ulps of unit numbers.
     torch.testing.assert_close(together[row], alone, rtol=0, atol=1e-5)
+
+
+@every_policy
+def test_the_place_in_a_tile_changes_no_digit(policy: str) -> None:
+    """Or an episode would depend on the environments that run beside it."""
+    trained, dims = make(policy)
+    model, size = trained.eval().for_inference(torch.float32), trained.sample_noise_size
+    generator = torch.Generator().manual_seed(3)
+    state = torch.randn(TILE, model.n_obs_steps, dims.state, generator=generator)
+    noise = torch.randn(TILE, size, generator=generator) if size else None
+    images = None
+    if dims.cameras:
+        shape = (TILE, model.n_obs_steps, dims.cameras, *dims.image, 3)
+        images = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
+    with torch.inference_mode():
+        first = model.predict(state, images, noise)
+        for places in range(1, TILE):
+            rolled = [None if x is None else x.roll(places, 0) for x in (state, images, noise)]
+            assert torch.equal(model.predict(*rolled), first.roll(places, 0))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.long

@@ -34,8 +34,11 @@ class ActConfig:
         feedforward_size: width inside the feed-forward blocks (Table III: 3200).
         num_heads: attention heads (public ACT: 8).
         encoder_layers: of the Transformer over latent, state and image features (public ACT: 4).
-        decoder_layers: of the Transformer over the K queries (public ACT: 7, of which it reads
+        decoder_layers: of the Transformer over the queries (public ACT: 7, of which it reads
             the first; see ``paper_compat``).
+        actions_per_query: successive actions that are read off one query of the decoder (public
+            ACT: 1); a divisor of ``chunk_size``. Without images the queries are nearly all of the
+            work, so that a training takes so many times less.
         state_layers: hidden layers, as wide as ``feedforward_size``, of the perceptron that makes
             the token of the state (public ACT: 0, one linear layer). Without images that token
             is the only observation; ``docs/act.md`` has the effect of hidden layers.
@@ -67,6 +70,7 @@ class ActConfig:
     num_heads: Annotated[int, Interval(ge=1, le=1024)] = 8
     encoder_layers: Layers = 4
     decoder_layers: Layers = 7
+    actions_per_query: Chunk = 1
     state_layers: Annotated[int, Interval(ge=0, le=256)] = 0
     latent_size: Width = 32
     cvae_layers: Layers = 4
@@ -83,6 +87,16 @@ class ActConfig:
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
+        if self.chunk_size % self.actions_per_query:
+            raise RequestError(
+                f"actions_per_query {self.actions_per_query}: must divide chunk_size "
+                f"{self.chunk_size}"
+            )
+
+    @property
+    def num_queries(self) -> int:
+        """Queries of the decoder."""
+        return self.chunk_size // self.actions_per_query
 
     def num_parameters(self, dims: PolicyDims) -> int:
         """Return about how many weights the network has: its matrices, and the ResNet-18."""
@@ -94,7 +108,8 @@ class ActConfig:
             count += (self.state_layers - 1) * forward**2 + forward * (dims.state + width)
         if dims.cameras:
             count += RESNET18_PARAMETERS
-        return count + width * (self.chunk_size + 2 * self.latent_size + dims.state + dims.action)
+        ends = 2 * self.latent_size + dims.state + dims.action * self.actions_per_query
+        return count + width * (self.num_queries + ends)
 
 
 PRESETS = {

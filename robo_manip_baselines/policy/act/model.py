@@ -341,10 +341,10 @@ class ActModel(PolicyModel):
         self.token_positions = nn.Parameter(torch.randn(2, width))
         self.vision = Vision(config, dims) if dims.cameras else None
         self.encoder = Encoder(config, config.encoder_layers)
-        self.queries = nn.Parameter(torch.randn(config.chunk_size, width))
+        self.queries = nn.Parameter(torch.randn(config.num_queries, width))
         num_run = 1 if config.paper_compat else config.decoder_layers
         self.decoder = Decoder(config, config.decoder_layers, num_run)
-        self.action_head = ExactLinear(width, dims.action)
+        self.action_head = ExactLinear(width, config.actions_per_query * dims.action)
         if config.backbone_weights is not None:
             load_backbone(self.vision and self.vision.backbone, config.backbone_weights)
 
@@ -412,7 +412,8 @@ class ActModel(PolicyModel):
             positions.append(image_positions)
         position_MD = torch.cat(positions)
         memory_BMD = self.encoder(torch.cat(tokens, dim=1), position_MD)
-        return self.action_head(self.decoder(self.queries, memory_BMD, position_MD))
+        actions = self.action_head(self.decoder(self.queries, memory_BMD, position_MD))
+        return actions.unflatten(-1, (self.config.actions_per_query, -1)).flatten(1, 2)
 
 
 def _state_projection(config: ActConfig, dims: PolicyDims) -> nn.Module:

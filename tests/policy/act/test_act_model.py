@@ -35,6 +35,8 @@ BLIND = PolicyDims(state=5, action=3, cameras=0, image=(40, 70))
         (PolicyDims(14, 7, 3, (480, 640)), {"paper_compat": True}, 83_915_399, 51_606_407),
         (PolicyDims(29, 7, 3, (480, 640)), {"paper_compat": True}, 83_930_759, 51_621_767),
         (PolicyDims(14, 7, 3, (480, 640)), {"use_cvae": False}, 66_539_079, 66_539_079),
+        # 90 queries of 512 less, and 9 × 7 more outputs of 512 + 1 weights.
+        (PolicyDims(14, 7, 3, (480, 640)), {"actions_per_query": 10}, 83_903_174, 83_903_174),
     ],
 )
 def test_how_many_parameters_there_are(
@@ -166,6 +168,18 @@ def test_by_default_every_layer_matters(make_model, make_batch):
         after = model.predict(batch.state, None, None)
         assert not torch.allclose(after, before)
         before = after
+
+
+def test_a_query_gives_successive_actions(make_model, make_batch):
+    model = make_model(actions_per_query=3)
+    assert model.queries.shape == (2, 16)
+    head = model.action_head
+    with torch.no_grad():
+        head.weight.zero_()
+        head.bias.copy_(torch.arange(9.0))
+    actions = model.eval().predict(make_batch().state, make_batch().images, None)
+    expected = torch.arange(9.0).view(3, 3).repeat(2, 1)  # the same for both queries
+    assert torch.equal(actions[0], expected)
 
 
 def test_cameras_are_told_apart(make_model, make_batch):
