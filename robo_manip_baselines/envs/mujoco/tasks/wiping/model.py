@@ -30,7 +30,7 @@ PATCH_DEPTH = 0.03
 
 CENTER_FROM_MOUTH = (-0.036, 0.036)
 """m across and up, from the mouth to the middle of the residue: on the cheek beside the nostril,
-40 mm below the eye, where an opening jaw hardly moves the skin."""
+44 mm below the eye, where an opening jaw hardly moves the skin."""
 
 HALF_SIDE = 0.0127
 """m, half the side of the square with residue: a square inch, as King et al. (IROS 2010) put on the
