@@ -20,3 +20,28 @@ def run(name: str) -> NoReturn:
         SystemExit: always.
     """
     run_command(lambda: import_module(f"{__name__}.{name}").main(sys.argv[1:]), backend_problem)
+
+
+def run_rollout() -> NoReturn:
+    """Run ``rmb-rollout``, which is ``bin/Rollout.py`` of an installed package."""
+    run("rollout")
+
+
+def run_train() -> NoReturn:
+    """Run ``rmb-train``."""
+    run("train")
+
+
+def run_benchmark() -> NoReturn:
+    """Run ``rmb-benchmark``."""
+    run("benchmark")
+
+
+def run_dataset() -> NoReturn:
+    """Run ``rmb-dataset``."""
+    run("dataset")
+
+
+def run_replay() -> NoReturn:
+    """Run ``rmb-replay``."""
+    run("replay")

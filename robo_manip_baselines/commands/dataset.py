@@ -1,4 +1,4 @@
-"""``bin/Dataset.py``: inspect and verify a folder of episodes."""
+"""``bin/Dataset.py``: inspect, verify and plot episodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from robo_manip_baselines.runs.command import parse
-from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.progress import closing_table
 
 EpisodeFolder = Annotated[
@@ -20,6 +20,10 @@ EpisodeFolder = Annotated[
     tyro.conf.arg(metavar="DIR", help="Folder of episode_*.hdf5 files, as Rollout.py writes it."),
     tyro.conf.Positional,
 ]
+
+
+IMAGE_TYPES = {".png": "agg", ".svg": "svg"}
+"""Suffix of an image -> Matplotlib's backend for it."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,37 @@ class Info:
     def run(self) -> tuple[str, int]:
         """Return the text to print and the exit code."""
         return closing_table(dataset_info(self.folder)), 0
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Draw the curves of an episode: joints and commands, gripper, target, phases."""
+
+    episode: Annotated[
+        Path, tyro.conf.arg(metavar="FILE", help="An episode_*.hdf5 file."), tyro.conf.Positional
+    ]
+    out: Path | None = None
+    """Image to write, .png or .svg; the episode's name with .png, in this folder, if not given."""
+
+    def run(self) -> tuple[str, int]:
+        """Return the text to print and the exit code."""
+        from robo_manip_baselines.benchmark.report.figures import styled_figure
+        from robo_manip_baselines.data.curves import draw_episode
+        from robo_manip_baselines.data.episode import EpisodeReader
+        from robo_manip_baselines.runs.files import atomic_file
+
+        out = self.out or Path(self.episode.with_suffix(".png").name)
+        kind = require_choice("--out: image of type", out.suffix, IMAGE_TYPES)
+        if out.exists():
+            raise RequestError(f"'{out}': is there already; choose another file with --out")
+        with (
+            EpisodeReader(self.episode) as episode,
+            styled_figure(IMAGE_TYPES[kind], "white") as figure,
+        ):
+            draw_episode(figure, episode)
+            with atomic_file(out) as path:
+                figure.savefig(path, format=kind[1:], dpi=120)
+        return f"written to '{out}'", 0
 
 
 def dataset_info(folder: Path) -> dict[str, str]:
@@ -126,7 +161,7 @@ def _spread(values: list[float]) -> str:
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Dataset.py``."""
     example = "python bin/Dataset.py verify dataset/FeedingEnv"
-    description = "Inspect and verify a folder of episodes."
-    text, code = parse(Verify | Info, example, description=description, args=args).run()
+    description = "Inspect, verify and plot episodes."
+    text, code = parse(Verify | Info | Plot, example, description=description, args=args).run()
     print(text)  # noqa: T201
     return code

@@ -99,3 +99,37 @@ def test_info_of_a_damaged_file_names_it(folder: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: '{path}' is no HDF5 file, or a damaged one: ")
     assert done.stderr.count("\n") == 1
+
+
+def test_plot_draws_every_curve_of_an_episode(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    out, episode = tmp_path / "curves.svg", episode_path(folder, 1, True)
+    done = dataset("plot", episode, "--out", out)
+    assert (done.returncode, done.stdout) == (0, f"written to '{out}'\n")
+    text = out.read_text()
+    for name in (
+        *make_attributes(1)["action_names"],
+        "gripper x",
+        "mouth z",
+        "FeedingEnv-v0, seed 1",
+    ):
+        assert name in text
+    before = out.read_bytes()
+    again = dataset("plot", episode, "--out", out)
+    assert again.returncode == 2
+    assert again.stderr == f"error: '{out}': is there already; choose another file with --out\n"
+    assert out.read_bytes() == before
+
+
+def test_plot_refuses_what_it_cannot_draw_or_write(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    missing, episode = tmp_path / "none.hdf5", episode_path(folder, 1, True)
+    for arguments, message in (
+        ((missing,), f"error: '{missing}' "),
+        ((episode, "--out", tmp_path / "a.gif"), "error: unknown --out: image of type '.gif'"),
+    ):
+        done = dataset("plot", *arguments)
+        assert done.returncode == 2
+        assert done.stderr.startswith(message)
+        assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "a.gif").exists()

@@ -147,3 +147,15 @@ def test_every_marker_in_use_is_declared(
             used |= set(re.findall(r"pytest\.mark\.(\w+)", (repository / f).read_text("utf-8")))
     assert used - builtin <= markers
     assert options["filterwarnings"][0] == "error"
+
+
+def test_every_program_of_bin_is_installed(pyproject: dict[str, Any], repository: Path) -> None:
+    from robo_manip_baselines import commands
+
+    for script in (repository / "bin").glob("*.py"):
+        name = script.stem.lower()
+        target = pyproject["project"]["scripts"][f"rmb-{name}"]
+        module, _, function = target.partition(":")
+        assert module == commands.__name__
+        assert f'run("{name}")' in script.read_text(encoding="utf-8")
+        assert callable(getattr(commands, function))
