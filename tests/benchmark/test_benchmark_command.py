@@ -289,6 +289,7 @@ def test_the_conditions_ship_with_the_package() -> None:
         "drinking.yaml",
         "feeding.yaml",
         "foresight_policies.yaml",
+        "wiping.yaml",
     }
 
 

@@ -28,6 +28,7 @@ TASKS = {
     "FeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.feeding:ENTRY",
     "DrinkingEnv": "robo_manip_baselines.envs.mujoco.tasks.drinking:ENTRY",
     "BimanualFeedingEnv": "robo_manip_baselines.envs.mujoco.tasks.bimanual_feeding:ENTRY",
+    "FaceWipingEnv": "robo_manip_baselines.envs.mujoco.tasks.wiping:ENTRY",
 }
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
 
