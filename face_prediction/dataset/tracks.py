@@ -78,14 +78,21 @@ def dataset_stretches(
         path = dataset.folder / CLIP_FOLDER / f"{entry.clip}.h5"
         with open_clip(path) as file:
             image_size = tuple(read_record(path, file)["image_size"])
-            arrays = [
+            mouth, orientation, jaw, landmarks = (
                 read_array(path, file, f"frames/{name}")
                 for name in ("mouth", "orientation", "jaw", "landmarks")
-            ]
-        quality: Quality = assess(*arrays[:3], settings.fps, settings.limits)
+            )
+        quality: Quality = assess(mouth, orientation, jaw, settings.fps, settings.limits)
         for start, stop in quality.segments():
             if stop - start >= least:
-                landmarks = pixel_landmarks(arrays[3][start:stop], image_size)
-                place = (entry.clip, entry.subject, entry.kind, entry.fold, start)
-                found.append(FaceStretch(*place, landmarks))
+                found.append(
+                    FaceStretch(
+                        clip=entry.clip,
+                        subject=entry.subject,
+                        kind=entry.kind,
+                        fold=entry.fold,
+                        start=start,
+                        landmarks=pixel_landmarks(landmarks[start:stop], image_size),
+                    )
+                )
     return found

@@ -46,7 +46,7 @@ def times_back(now: float, count: int, fps: float) -> NDArray[np.float64]:
 
 
 def landmarks_at(
-    wanted: NDArray[np.float64], times: NDArray[np.float64], landmarks: NDArray[np.floating]
+    wanted: NDArray[np.floating], times: NDArray[np.float64], landmarks: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Landmarks (T, L, C) at ``wanted`` (T,) s, of those (N, L, C) at increasing ``times`` (N,) s.
 
@@ -260,7 +260,7 @@ class StreamingPredictor:
         times: NDArray[np.float64],
         points: NDArray[np.floating],
         size: tuple[int, int],
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.floating]:
         """Landmarks (H, L, 2) ahead in pixels, by what was learnt at a constant rate so far.
 
         The predictor learns on a clock of its own, which began with the face; it forecasts from

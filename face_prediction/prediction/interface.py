@@ -104,7 +104,7 @@ class FaceFollower(Protocol):
         """Take in the next frame, (L, 2), a frame period after the one before."""
         ...
 
-    def forecast(self, recent: NDArray[np.floating], horizon: int) -> NDArray[np.float64]:
+    def forecast(self, recent: NDArray[np.floating], horizon: int) -> NDArray[np.floating]:
         """Forecast (H, L, 2) from what was learnt, and the last frames ``recent`` (W, L, 2).
 
         These are a frame period apart, the newest last; they need not be those that were taken in.

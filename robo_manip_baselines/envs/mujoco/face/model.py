@@ -126,7 +126,7 @@ class FaceModel:
     def jaw_at(self, angle: ArrayLike) -> Floats:
         """Distance (...) m between the inner lips at jaw angles (...) rad: `jaw_angle` undone."""
         distance, table = self._openings
-        return np.asarray(np.interp(angle, table, distance))
+        return np.asarray(np.interp(np.asarray(angle, np.float64), table, distance))
 
     @cached_property
     def _openings(self) -> tuple[Floats, Floats]:
