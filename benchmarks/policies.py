@@ -42,13 +42,7 @@ OBSERVATIONS = {
 }
 """Name of an observation -> its options of ``bin/Train.py``."""
 
-OPTIONS: dict[str, list[str]] = {
-    "Act": ["--no_use_cvae", "--feedforward_size", "256"],
-    "Mlp": [],
-    "Diffusion": [],
-    "Flow": [],
-}
-"""Policy -> its options beside ``--preset cpu``; those of Act are of the shipped checkpoints."""
+POLICIES = ("Act", "Mlp", "Diffusion", "Flow")
 
 TABLE = "policies.md"
 
@@ -72,7 +66,7 @@ class Options:
     """
 
     dataset: Path
-    policies: tuple[str, ...] = tuple(OPTIONS)
+    policies: tuple[str, ...] = POLICIES
     observations: tuple[str, ...] = tuple(OBSERVATIONS)
     delay: Episodes = 4
     train_seeds: tuple[Seed, ...] = (0,)
@@ -85,7 +79,7 @@ class Options:
 
     def __post_init__(self) -> None:
         for policy in self.policies:
-            require_choice("policy", policy, OPTIONS)
+            require_choice("policy", policy, POLICIES)
         for observation in self.observations:
             require_choice("observation", observation, OBSERVATIONS)
 
@@ -118,7 +112,7 @@ def run(options: Options, policy: str, observation: str, train_seed: int) -> Row
     """Train, or continue; evaluate, or continue; and measure."""
     name = f"{policy.lower()}_{observation}_seed{train_seed}"
     folder = options.out / "runs" / name
-    words = [*OBSERVATIONS[observation], "--delay", str(options.delay), *OPTIONS[policy]]
+    words = [*OBSERVATIONS[observation], "--delay", str(options.delay)]
     words += ["--preset", "cpu", "--steps", str(options.steps), "--seed", str(train_seed)]
     words += ["--dataset", str(options.dataset), "--logger", "none", "--out", str(folder)]
     if train(parse_config([policy, *words]), resume=True):

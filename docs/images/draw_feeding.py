@@ -27,7 +27,7 @@ def main() -> None:
         while np.linalg.norm(world.cube_offset) > NEAR:
             world.step(actor.act())
         camera = mujoco.MjvCamera()
-        camera.lookat[:] = world.cube_position + [0.0, 0.0, -0.02]
+        camera.lookat[:] = world.cube_position - np.array([0.0, 0.0, 0.02])
         camera.distance, camera.azimuth, camera.elevation = 0.55, 128.0, -12.0
         with mujoco.Renderer(world.model, 500, 800) as renderer:
             renderer.update_scene(world.data, camera)

@@ -95,7 +95,7 @@ PRESETS: dict[str, BenchmarkPreset] = {
         demonstration_block=25,
         num_episodes=100,
         episode_block=50,
-        seconds={"demonstrations": 2.0, "training": 460.0, "evaluation": 1.2, "video": 40.0},
+        seconds={"demonstrations": 2.0, "training": 90.0, "evaluation": 1.2, "video": 40.0},
     ),
     # The paper's setting (Table III, section IV.C): three cameras, 50 demonstrations, 50 episodes.
     "paper": BenchmarkPreset(

@@ -207,7 +207,11 @@ def read_config(path: Path) -> dict[str, Any]:
     Raises:
         RequestError: it cannot be read, or is no mapping.
     """
-    return read_yaml(path)
+    values = read_yaml(path)
+    if "latent_size" in values:
+        # Runs of release 0.1.0, whose files have all options of ACT, lack this one.
+        values.setdefault("actions_per_query", 1)
+    return values
 
 
 def write_config(run: Path, config: TrainConfig[Any]) -> None:

@@ -204,7 +204,8 @@ validate_every: 500
 checkpoint_every: 1000
 """
     (tmp_path / "config.yaml").write_text(text)
-    given = parse("Act --preset cpu --error uniform --delay 3 --steps 9")
+    network = "--use_cvae --cvae_layers 1 --feedforward_size 512 --actions_per_query 1"
+    given = parse(f"Act --preset cpu {network} --error uniform --delay 3 --steps 9")
     resumed = parse(f"Act --out {tmp_path} --resume")
     assert resumed.to_json() == {**given.to_json(), "out": str(tmp_path)}
     require_same_config(tmp_path, given)
@@ -231,9 +232,9 @@ def test_dropout_of_the_network_is_not_that_of_the_face() -> None:
 
 
 def test_resuming_reads_the_options_of_the_run(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("steps: 77\nchunk_size: 3\n")
+    (tmp_path / "config.yaml").write_text("steps: 77\nchunk_size: 7\n")
     resumed = parse(f"Act --preset cpu --out {tmp_path} --resume")
-    assert (resumed.training.steps, resumed.network.chunk_size) == (77, 3)
+    assert (resumed.training.steps, resumed.network.chunk_size) == (77, 7)
     assert parse(f"Act --preset cpu --out {tmp_path}").training.steps != 77
 
 

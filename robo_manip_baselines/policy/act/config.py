@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from annotated_types import Interval
@@ -37,8 +37,8 @@ class ActConfig:
         decoder_layers: of the Transformer over the queries (public ACT: 7, of which it reads
             the first; see ``paper_compat``).
         actions_per_query: successive actions that are read off one query of the decoder (public
-            ACT: 1); a divisor of ``chunk_size``. Without images the queries are nearly all of the
-            work, so that a training takes so many times less.
+            ACT: 1), at most ``chunk_size``; what the last query gives beyond the chunk is left out.
+            Without images the queries are nearly all of the work of a training.
         state_layers: hidden layers, as wide as ``feedforward_size``, of the perceptron that makes
             the token of the state (public ACT: 0, one linear layer). Without images that token
             is the only observation; ``docs/act.md`` has the effect of hidden layers.
@@ -87,16 +87,16 @@ class ActConfig:
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
-        if self.chunk_size % self.actions_per_query:
+        if self.actions_per_query > self.chunk_size:
             raise RequestError(
-                f"actions_per_query {self.actions_per_query}: must divide chunk_size "
+                f"actions_per_query {self.actions_per_query}: must be at most chunk_size "
                 f"{self.chunk_size}"
             )
 
     @property
     def num_queries(self) -> int:
         """Queries of the decoder."""
-        return self.chunk_size // self.actions_per_query
+        return -(-self.chunk_size // self.actions_per_query)
 
     def num_parameters(self, dims: PolicyDims) -> int:
         """Return about how many weights the network has: its matrices, and the ResNet-18."""
@@ -122,15 +122,16 @@ PRESETS = {
         config=ActConfig(
             chunk_size=30,
             hidden_size=128,
-            feedforward_size=512,
+            feedforward_size=256,
             num_heads=4,
             encoder_layers=1,
             decoder_layers=1,
+            actions_per_query=5,
             state_layers=2,
-            cvae_layers=1,
+            use_cvae=False,
             dropout=0.0,
         ),
-        training=STATE_ONLY_TRAINING,
+        training=replace(STATE_ONLY_TRAINING, steps=3000),
         execution=ActionExecution(),
         cameras=(),
         object_pose=True,

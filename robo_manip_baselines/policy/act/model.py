@@ -413,7 +413,8 @@ class ActModel(PolicyModel):
         position_MD = torch.cat(positions)
         memory_BMD = self.encoder(torch.cat(tokens, dim=1), position_MD)
         actions = self.action_head(self.decoder(self.queries, memory_BMD, position_MD))
-        return actions.unflatten(-1, (self.config.actions_per_query, -1)).flatten(1, 2)
+        actions = actions.unflatten(-1, (self.config.actions_per_query, -1)).flatten(1, 2)
+        return actions[:, : self.chunk_size]
 
 
 def _state_projection(config: ActConfig, dims: PolicyDims) -> nn.Module:

@@ -170,16 +170,17 @@ def test_by_default_every_layer_matters(make_model, make_batch):
         before = after
 
 
-def test_a_query_gives_successive_actions(make_model, make_batch):
-    model = make_model(actions_per_query=3)
-    assert model.queries.shape == (2, 16)
-    head = model.action_head
+@pytest.mark.parametrize(("per_query", "queries"), [(1, 6), (3, 2), (4, 2), (6, 1)])
+def test_a_query_gives_successive_actions(make_model, make_batch, per_query: int, queries: int):
+    model = make_model(actions_per_query=per_query)
+    assert model.queries.shape == (queries, 16)
+    numbers = torch.arange(3.0 * per_query)
     with torch.no_grad():
-        head.weight.zero_()
-        head.bias.copy_(torch.arange(9.0))
+        model.action_head.weight.zero_()
+        model.action_head.bias.copy_(numbers)
     actions = model.eval().predict(make_batch().state, make_batch().images, None)
-    expected = torch.arange(9.0).view(3, 3).repeat(2, 1)  # the same for both queries
-    assert torch.equal(actions[0], expected)
+    expected = numbers.view(per_query, 3).repeat(queries, 1)  # the same for all queries
+    assert torch.equal(actions[0], expected[:6])
 
 
 def test_cameras_are_told_apart(make_model, make_batch):

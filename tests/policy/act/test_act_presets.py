@@ -25,5 +25,7 @@ def test_paper_is_table_3() -> None:
 
 def test_cpu_sees_no_images() -> None:
     preset = PRESETS["cpu"]
+    assert (preset.config.num_queries, preset.config.use_cvae) == (6, False)
+    assert preset.training.steps == 3000
     assert preset.cameras == ()
     assert preset.object_pose
