@@ -62,9 +62,8 @@ def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> No
         assert spec.relative == (spec.obs != "current")
         shown = spec.obs
         if spec.obs == "current_pred":
-            is_model = corruption.error == "model"
-            shown = "residual" if is_model else corruption.prediction
-            assert spec.horizon == (5 if is_model else corruption.delay + 12)
+            shown = "residual" if corruption.error == "model" else corruption.prediction
+            assert spec.horizon == corruption.delay + 12
         cell = c.motion, corruption.delay
         cells.setdefault(cell, []).append(shown)
         assert c.name == f"{c.motion}_delay{corruption.delay}_{shown}"
