@@ -284,6 +284,7 @@ def test_help_names_the_options_and_an_example() -> None:
 
 def test_the_conditions_ship_with_the_package() -> None:
     assert {path.name for path in CONDITIONS.glob("*.yaml")} == {
+        "bimanual_feeding.yaml",
         "delay.yaml",
         "demo.yaml",
         "drinking.yaml",

@@ -184,7 +184,8 @@ def test_little_is_drawn_too(make_rows: MakeRows) -> None:
     )
     statistics = analyze([replace(rows[0], result=result)], task=TASK, resamples=50)
     figures = {figure.name: figure for figure in benchmark_figures(statistics)}
-    assert list(figures) == ["success_by_horizon", "completion_times", "arrivals", "failures"]
+    names = ["success_by_horizon", "completion_times", "arrivals", "failures", "touches"]
+    assert list(figures) == names
     for figure in figures.values():
         ElementTree.fromstring(figure.svg)
         assert "paper" not in figure.caption
@@ -205,7 +206,7 @@ def test_a_task_with_kinds_of_failure_of_its_own(make_rows: MakeRows) -> None:
     )
     statistics = analyze(named, task=task, resamples=50)
     figures = {figure.name: figure for figure in benchmark_figures(statistics)}
-    assert list(figures) == ["success_by_horizon", "completion_times", "failures"]
+    assert list(figures) == ["success_by_horizon", "completion_times", "failures", "touches"]
     assert "from the first touch to success, s" in words(figures["completion_times"])
     assert {f"kind {number}" for number in range(9)} <= set(words(figures["failures"]))
     assert "<pattern" in figures["failures"].svg

@@ -202,7 +202,7 @@ def test_one_training_seed_has_no_columns_for_several(
     rows = make_rows(conditions=["shuffled_future"], train_seeds=1, episodes=6)
     tables = benchmark_tables(analyze(rows, task=TASK, resamples=50))
     # Nothing to compare with: neither another condition, nor the paper, nor a finding.
-    names = ["success", "completion_times", "measures", "failures"]
+    names = ["success", "completion_times", "safety", "measures", "failures"]
     assert [table.name for table in tables] == names
     assert "by_training_seed" not in to_csv(tables[1])
     assert "bootstrap" not in to_markdown(tables[0])
