@@ -112,13 +112,18 @@ def draw_gains(path: Path, all_scores: Sequence[TrackScores]) -> None:
     """Error of the first network against the best baseline's, by the smoothness of the motion.
 
     A dot is a person, the larger the more frames there are of them; frames 3-5 of whole tracks.
+    Without a network that forecasts whole tracks there is no figure.
     """
+    networks = [[i for i, (_, role) in enumerate(s.rows) if role == "network"] for s in all_scores]
+    if not any(networks):
+        return
     figure = new_matplotlib_figure(6.4, 4.0)
     axes = figure.subplots()
-    for scores, colour in zip(all_scores, COLOURS, strict=False):
-        row = next(i for i, (_, role) in enumerate(scores.rows) if role == "network")
+    for scores, rows, colour in zip(all_scores, networks, COLOURS, strict=False):
+        if not rows:
+            continue
         best = np.maximum(scores.errors[:, scores.best, FAR], 1e-300)
-        gain = 100 * (scores.errors[:, row, FAR] / best - 1)
+        gain = 100 * (scores.errors[:, rows[0], FAR] / best - 1)
         seen = scores.counts[:, FAR] > 0
         size = 6 + 4 * np.sqrt(scores.frames[seen] / 30)
         label = f"{scores.kind}, against {scores.rows[scores.best][0]}"

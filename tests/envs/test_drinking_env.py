@@ -258,7 +258,7 @@ def test_the_level_is_seen() -> None:
     env.close()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("expert", sorted(ENTRY.experts))
 def test_at_least_45_of_50_episodes_succeed(world: DrinkingEnv, expert: str) -> None:
     failed = []

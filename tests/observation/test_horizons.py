@@ -44,7 +44,10 @@ def ahead(horizon: int, corruption: Corruption | None = None) -> ObservationSpec
 def as_version_2(path: Path, out: Path) -> Path:
     """Write an episode as releases before schema 3 did, with the truth 5 frames ahead."""
     with EpisodeReader(path) as episode:
-        arrays = {**episode.arrays, "mouth_position": episode.array("mouth_position")[:, :6]}
+        later = ("region_force", "region_impulse")  # of schema 4
+        arrays = {name: array for name, array in episode.arrays.items() if name not in later}
+        arrays["mouth_position"] = episode.array("mouth_position")[:, :6]
+        arrays["predicted_mouth"] = episode.array("predicted_mouth")[:, :5]
         given = [item.name for item in episode.schema.attributes if not item.is_derived]
         attributes = {name: episode.attributes[name] for name in given}
     return write_episode(out / path.name, arrays, {}, attributes)
@@ -257,7 +260,7 @@ def test_old_and_new_files_of_a_seed_show_the_same_and_replay(tmp_path: Path) ->
     collect(wanted)
     path = episode_path(new, SEED, success=True)
     with EpisodeReader(path) as episode:
-        assert episode.attributes["schema_version"] == 3
+        assert episode.attributes["schema_version"] == 4
         assert episode.array("mouth_position").shape[1:] == (25, 3)
         assert episode.array("predicted_mouth").shape[1:] == (24, 3)
         assert "predicted_mouth" in EpisodeSchema.of(episode.task).by_name

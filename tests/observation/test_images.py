@@ -102,7 +102,8 @@ def shown(loaded: Demonstrations) -> np.ndarray:
 @pytest.mark.gl
 @pytest.mark.parametrize("size", SHOWN)
 def test_what_is_trained_on_is_what_is_shown(recorded: Path, size: tuple[int, int]) -> None:
-    spec = ObservationSpec(cameras=CAMERAS, image_size=size)
+    arms = task_entry(recorded.name).arms[0]
+    spec = ObservationSpec(cameras=CAMERAS, image_size=size, arms=arms)
     loaded = load_demonstrations(recorded, spec)
     assert loaded.spec.drawn_size == RECORDED
     images = trained_on(loaded)
