@@ -108,7 +108,7 @@ def test_two_conditions_that_are_the_same_but_for_the_name_are_trained_twice() -
     assert first.folder != second.folder
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(st.integers(1, 40), st.integers(1, 12), st.integers(1, 30), st.integers(1, 9))
 def test_every_seed_is_there_once(
     demonstrations: int, block: int, episodes: int, episode_block: int

@@ -79,7 +79,7 @@ def test_the_face_waits_for_the_lift_or_does_not(world: FeedingEnv) -> None:
     np.testing.assert_allclose(site, world.mouth_track[0], atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("expert", ["reactive", "anticipatory"])  # test_servo.py has the other
 def test_at_least_48_of_50_episodes_succeed(expert: str) -> None:
     env = make_env("FeedingEnv", cameras=())

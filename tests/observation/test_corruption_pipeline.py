@@ -60,7 +60,7 @@ corruptions = st.builds(
 
 
 @pytest.mark.long
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(
     corruptions,
     st.integers(0, 2**32),
@@ -82,7 +82,7 @@ def test_online_is_offline(
 
 
 @pytest.mark.long
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(corruptions, st.integers(1, 60), st.integers(0, 9))
 def test_the_past_is_what_was_reported_then(corruption: Corruption, steps: int, drawn: int) -> None:
     """Steps at 30 a second: the report k frames ago is that of the k-th step before."""
