@@ -49,7 +49,10 @@ from robo_manip_baselines.training.requirements import prepare_pytorch
 DEMONSTRATIONS = {"expert": "servo", "motion": "dyskinetic", "people": "train", "cameras": "none"}
 """Options of ``bin/Rollout.py FeedingEnv --scripted``."""
 
-NETWORK = {"preset": "cpu", "actions_per_query": 1, "seed": 0, "logger": "none"}
+NETWORK = {
+    **{"preset": "cpu", "cvae_layers": 1, "actions_per_query": 1},
+    **{"seed": 0, "logger": "none"},
+}
 """Options of ``bin/Train.py Act`` for every policy: about 460 000 weights."""
 
 POLICIES: dict[str, dict[str, Any]] = {

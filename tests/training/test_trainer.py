@@ -40,7 +40,7 @@ MLP = "Mlp --preset cpu --chunk_size 3 --hidden_size 8 --dropout 0.2 --batch_siz
 PLAIN = f"{MLP} --validation_fraction 0.2 --warmup_steps 0 --ema_decay 0"
 ACT = (
     "Act --preset cpu --chunk_size 3 --hidden_size 8 --feedforward_size 8 --num_heads 2 "
-    "--encoder_layers 1 --decoder_layers 1 --cvae_layers 1 --batch_size 4 "
+    "--encoder_layers 1 --decoder_layers 1 --use_cvae --cvae_layers 1 --batch_size 4 "
     "--validation_fraction 0.2"
 )
 FLOW = (

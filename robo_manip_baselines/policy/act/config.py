@@ -37,7 +37,7 @@ class ActConfig:
         decoder_layers: of the Transformer over the queries (public ACT: 7, of which it reads
             the first; see ``paper_compat``).
         actions_per_query: successive actions that are read off one query of the decoder (public
-            ACT: 1), at most ``chunk_size``; what the last query gives beyond the chunk is left out.
+            ACT: 1); what the last query gives beyond the chunk is left out.
             Without images the queries are nearly all of the work of a training.
         state_layers: hidden layers, as wide as ``feedforward_size``, of the perceptron that makes
             the token of the state (public ACT: 0, one linear layer). Without images that token
@@ -87,11 +87,6 @@ class ActConfig:
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
-        if self.actions_per_query > self.chunk_size:
-            raise RequestError(
-                f"actions_per_query {self.actions_per_query}: must be at most chunk_size "
-                f"{self.chunk_size}"
-            )
 
     @property
     def num_queries(self) -> int:

@@ -32,7 +32,7 @@ def test_the_defaults_are_those_of_table_three_and_of_the_public_code():
         ({"num_heads": -1}, "num_heads -1: must be 1 to 1024"),
         ({"hidden_size": 510, "num_heads": 2}, "hidden_size 510: must be a multiple of 4"),
         ({"num_heads": 7}, "hidden_size 512: must be a multiple of num_heads 7"),
-        ({"actions_per_query": 101}, "actions_per_query 101: must be at most chunk_size 100"),
+        ({"actions_per_query": 0}, "actions_per_query 0: must be 1 to 10000"),
         ({"dropout": 1.0}, "dropout 1.0: must be 0 or more, less than 1"),
         ({"dropout": -0.1}, "dropout -0.1: must be 0 or more, less than 1"),
         ({"kl_weight": -1.0}, "kl_weight -1.0: must be 0 or more, and finite"),
@@ -53,7 +53,7 @@ def test_a_wrong_value_is_refused_in_one_line(settings: dict[str, Any], message:
     "settings",
     [
         {"chunk_size": 1},
-        {"actions_per_query": 100},
+        {"actions_per_query": 101},
         {"hidden_size": 4, "num_heads": 4},
         {"dropout": 0.0},
         {"kl_weight": 0.0},

@@ -170,7 +170,7 @@ def test_by_default_every_layer_matters(make_model, make_batch):
         before = after
 
 
-@pytest.mark.parametrize(("per_query", "queries"), [(1, 6), (3, 2), (4, 2), (6, 1)])
+@pytest.mark.parametrize(("per_query", "queries"), [(1, 6), (3, 2), (4, 2), (6, 1), (7, 1)])
 def test_a_query_gives_successive_actions(make_model, make_batch, per_query: int, queries: int):
     model = make_model(actions_per_query=per_query)
     assert model.queries.shape == (queries, 16)
