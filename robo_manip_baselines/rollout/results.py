@@ -120,7 +120,7 @@ class EpisodeResult:
 
     @property
     def success_safe(self) -> bool | None:
-        """Whether it is a safe success, see `EpisodeSafety`; None in rows of earlier releases."""
+        """True for a safe success, see `EpisodeSafety`; None in rows of earlier releases."""
         return None if self.safety is None else self.safety.success_safe
 
     def to_line(self) -> str:

@@ -1,4 +1,4 @@
-"""Where liquid counts as drunk, and the order in which things may happen."""
+"""Places where liquid counts as drunk, and the order in which things may happen."""
 
 from __future__ import annotations
 

@@ -302,7 +302,7 @@ class Ring:
 
 
 class _Learner:
-    """What a linear expert has learnt from N faces.
+    """State that a linear expert has learnt from N faces.
 
     A row is learnt from when its outcome is known, h frames later. All horizons of a band weight it
     alike, so that their matrices are one that grows from frame to frame, seen h frames ago.

@@ -89,7 +89,7 @@ def test_a_dataset_with_one_fold_has_nobody_to_fit_to(dataset: Path, tmp_path: P
 
 @dataclass
 class Record:
-    """What is read of a checkpoint's record."""
+    """Fields that are read of a checkpoint's record."""
 
     dataset_sha256: str
     folds: dict

@@ -1,4 +1,4 @@
-"""What can be touched of the face: hidden geoms, of the head that is drawn and of the physical one.
+"""Collision geoms of the face, hidden: of the head that is drawn, and of the physical one.
 
 Frames and bodies are those of `build`. Regions of the face are told apart in `contact`.
 """

@@ -664,7 +664,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         }
 
     def _is_refusing(self) -> bool | None:
-        """Whether a head that refuses now and then is turned away; None where it never does."""
+        """Return True while a head that refuses is turned away; None where it never refuses."""
         if not self.motion.refuses:
             return None
         return bool(facing_angle(self.head_orientation) > REFUSAL_ANGLE)

@@ -103,7 +103,7 @@ def jet_at(time: float | Floats, start: Floats, velocity: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Liquid:
-    """Where the serving is: in the cup, in the mouth, or anywhere else.
+    """Volumes of the serving: in the cup, in the mouth, or anywhere else.
 
     Attributes:
         left, delivered, spilled: m³; their sum is always `SERVING`.
