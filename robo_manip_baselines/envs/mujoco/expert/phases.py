@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import mink
 import numpy as np
@@ -276,7 +276,13 @@ class PhasedExpert:
     Args:
         arm: ``left`` or ``right``.
         home: (6,) rad, joints with which an episode starts, the fingers open.
+
+    Attributes:
+        goes_by_observation: whether it sees the mouth as the environment observes it; others know
+            the truth.
     """
+
+    goes_by_observation: ClassVar[bool] = False
 
     def __init__(self, arm: str = "right", home: Sequence[float] = HOME_QPOS) -> None:
         self._kinematics, self._start = ArmKinematics(arm), home

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -18,6 +19,7 @@ from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, Ca
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import FACES, REST_OPENING, FaceModel, add_face
+from robo_manip_baselines.envs.mujoco.face.camera_mouth import CameraMouth
 from robo_manip_baselines.envs.mujoco.face.contact import FaceTouch
 from robo_manip_baselines.envs.mujoco.face.forecasters import (
     MotionForecasters,
@@ -43,9 +45,11 @@ from robo_manip_baselines.observation import (
     ObservationSpec,
     ObservedNames,
     State,
+    TargetObservation,
 )
 from robo_manip_baselines.observation.corruption import prediction_problem
 from robo_manip_baselines.observation.images import fit_image
+from robo_manip_baselines.observation.spec import CameraLatency
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 from robo_manip_baselines.runs.ranges import MAX_SEED
 
@@ -92,6 +96,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         render_size: height and width at which cameras are drawn, before `fit_image` makes the
             images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
+        mouth_source, camera_latency: see `ObservationSpec` and ``docs/perception.md``.
         face: kind of face: ``visual``, which follows the recorded motion whatever touches it, or
             ``physical``, soft tissue on a head that yields, see ``docs/face_model.md``.
         face_motion: start of the motion: ``episode`` or ``after_lift``.
@@ -116,6 +121,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         measures_proximity: whether ``info`` has distances from the face, which take a tenth of a
             millisecond a step; evaluations set it.
         vector: (S,) float32, all vectors of the last observation, packed.
+        observed_target: the target of the last observation; None where it is the truth.
 
     Raises:
         RequestError: an argument is not valid.
@@ -140,6 +146,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         relative: bool = False,
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
+        mouth_source: str = "truth",
+        camera_latency: CameraLatency = 1,
         face: str = "visual",
         face_motion: str = "episode",
         motion: str | Mapping[str, Any] | Sequence[Any] = "recorded",
@@ -165,6 +173,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             relative=relative,
             arms=arms,
             corruption=_make_corruption(corruption),
+            mouth_source=mouth_source,
+            camera_latency=camera_latency,
         )
         self.task.require_arms(spec.arms)
         _check_drawing(shadows, multisamples)
@@ -184,7 +194,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.library.require(motion_sha256)
         if self.motion.recorded is not None:
             self.library.part(self.people)  # refuses what cannot be split
-        self.task.require_forecasts(spec.corruption)
+        self.task.require_forecasts(spec)
         self._forecasters: MotionForecasters | None = None
         if spec.corruption.prediction != "truth":
             require_no_waiting(self.face_motion)
@@ -215,6 +225,11 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.renderer = CameraRenderer(
             self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )
+        self.observed_target: TargetObservation | None = None
+        self._camera_mouth: CameraMouth | None = None
+        if spec.sees_by_camera:
+            has_depth = spec.mouth_source == "depth_camera"
+            self._camera_mouth = CameraMouth(self.model, spec.camera_latency, has_depth=has_depth)
         self._viewer: Any = None
         self._stage = "made"
         self._index_model()
@@ -342,6 +357,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 self._forecast = self._forecasters.forecast_track(
                     self.observation_spec.corruption.prediction, self.replay.mouth, drawn
                 )
+        if self._camera_mouth:
+            self._camera_mouth.reset(self.data)
         self._stage = "reset"
         self._show()
         return self.observe(), {**self.info(), **self._safety_info()}
@@ -378,6 +395,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             mujoco.mj_step(self.model, self.data)
             self.touch.read(self.model, self.data)
             self.watch_contacts()
+            if self._camera_mouth:
+                self._camera_mouth.watch(self.data, self.step_count * self.substeps + substep + 1)
         self.step_count += 1
         if self._compliant_head:
             self._compliant_head.place_mouth(self.data)
@@ -426,6 +445,9 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         """Free the OpenGL context, and close the viewer; may be called again."""
         self._stage = "closed"
         self.renderer.close()
+        if self._camera_mouth:
+            self._camera_mouth.close()
+            self._camera_mouth = None
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None
@@ -510,6 +532,26 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         moving = np.clip(np.asarray(time, dtype=np.float64) - start, 0.0, SEGMENT_DURATION)
         return MOUTH_BASE + self.face_offset + self.segment.displacement_at(moving)
 
+    def forecast_mouth(self, seen: float, ahead: float) -> Floats:
+        """(3,) m, world: the mouth at ``seen + ahead`` s by what is observed; a `Forecast`.
+
+        The true one where observations show the truth. Otherwise that of the newest report,
+        whatever ``seen`` says, with the forecasts in it.
+        """
+        if self.observed_target is None:
+            return self.mouth_at(seen + ahead)
+        return self.observed_target.at(seen + ahead)
+
+    @property
+    def frames_without_detection(self) -> int | None:
+        """Images of the episode in which no face was found; None where nobody looks for one."""
+        return self._camera_mouth.frames_without_face if self._camera_mouth else None
+
+    @property
+    def camera_mouth(self) -> CameraMouth | None:
+        """Camera that observes the mouth, if one does."""
+        return self._camera_mouth
+
     def landmark_track(self, landmark: int) -> Floats:
         """(K, 3) m, world: a point of the face now and 1 ... 24 frames ahead.
 
@@ -579,13 +621,24 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         The vectors are views of ``vector``. Images are left out where ``renders_images`` is False.
         """
         spec, state = self.observation_spec, self.state()
-        self.vector = spec.pack(state, self._pipeline.observe(state) if self._pipeline else None)
+        self.observed_target = self._observe_target(state)
+        self.vector = spec.pack(state, self.observed_target)
         observation: dict[str, NDArray[Any]] = {**spec.split(self.vector, self.task.names)}
         if spec.cameras and self.renders_images:
             views = self.renderer.render(self.data, spec.cameras)
             for key, camera in spec.image_keys().items():
                 observation[key] = fit_image(views[camera], spec.image_size)
         return observation
+
+    def _observe_target(self, state: State) -> TargetObservation | None:
+        """Return the target as it is observed; None where that is the truth."""
+        if self._pipeline:
+            return self._pipeline.observe(state)
+        if self._camera_mouth is None:
+            return None
+        past = self.observation_spec.past_frames
+        seen = self._camera_mouth.observe(self.time)
+        return replace(seen, past=self._camera_mouth.past(self.time, past) if past else None)
 
     def episode_row(self) -> dict[str, Any]:
         """Return the present row of an episode file: the state before an action."""

@@ -181,9 +181,11 @@ class FeedingServo(FeedingExpert):
     Args:
         env: the environment, unwrapped.
         config: lead, delay and limits of the servo.
-        forecast: source of the mouth; the truth if None.
+        forecast: source of the mouth; what the environment observes, or else the truth, if None.
         execution: of its plans, from the insertion on.
     """
+
+    goes_by_observation = True
 
     def __init__(
         self,
@@ -194,7 +196,7 @@ class FeedingServo(FeedingExpert):
     ) -> None:
         super().__init__(env)
         self._config = ServoConfig() if config is None else config
-        self._forecast = self._truth if forecast is None else forecast
+        self._forecast = env.forecast_mouth if forecast is None else forecast
         self._execution = execution
 
     def branch(
@@ -230,6 +232,3 @@ class FeedingServo(FeedingExpert):
     def _seen(self, view: ExpertView) -> NDArray[np.float64]:
         """Return the newest mouth seen, (3,) m."""
         return self._forecast(view.time - self._config.delay * FRAME_PERIOD, 0.0)
-
-    def _truth(self, seen: float, ahead: float) -> NDArray[np.float64]:
-        return self._env.mouth_at(seen + ahead)
