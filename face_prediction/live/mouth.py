@@ -39,12 +39,26 @@ DEPTH_MEMORY = 0.3
 """s, time constant of the mean of distances. A pixel of a head 120 pixels wide is 5 mm at 0.6 m,
 and a head comes nearer more slowly than it moves across."""
 
-LEAST_VISIBLE = 8
-"""Rigid landmarks, of 25, on which a depth image must show the head for its distance to count."""
-
 HEAD_DEPTH = 0.04
-"""m by which a measured distance may differ from that of the posed head and still be of the head:
-half of a nose-to-temple depth. What is farther off is a hand before it or a wall behind it."""
+"""m by which measured distances of a head may be off from their median: what is farther off is a
+hand before it or a wall behind it."""
+
+LIP_DEPTH = 0.03
+"""m, likewise of the outer lips: 5 cm wide, seen from the side, and tilted by an open jaw."""
+
+LIP_IMAGES = 30
+"""Images, a second of them, over which the distance of the lips from the head is averaged."""
+
+LEAST_RIGID, LEAST_LIPS = 8, 19
+"""Landmarks, of 25 and of 20, that must be within: the nose hides some of the former, and of the
+latter, which lie at different depths, the mean must not lean to one side."""
+
+# fmt: off
+OUTER_LIPS = (
+    0, 17, 37, 39, 40, 61, 84, 91, 146, 181, 185, 267, 269, 270, 291, 314, 321, 375, 405, 409,
+)
+# fmt: on
+"""Landmarks on the outer edge of the lips: skin, whatever the mouth does."""
 
 _RIGID = np.array(RIGID_LANDMARKS)
 _INDEX = _RIGID[:, 0].astype(int)
@@ -77,29 +91,31 @@ def head_pose_of_points(points: NDArray[np.floating], image_size: Size, fov: flo
     return pose
 
 
-def measured_distance(
-    points: NDArray[np.floating], pose: NDArray[np.floating], depth: NDArray[np.floating]
+def agreed_excess(
+    points: NDArray[np.floating],
+    expected: NDArray[np.floating] | float,
+    depth: NDArray[np.floating],
+    tolerance: float,
+    least: int,
 ) -> float | None:
-    """Distance in m along the view by which the head is farther away than its pose says.
+    """Mean in m by which points are farther away in a depth image than expected.
 
     Args:
-        points: (L, 2 or 3) normalised image coordinates.
-        pose: (4, 4) camera from head.
+        points: (P, 2) normalised image coordinates.
+        expected: (P,) m along the view, or one for all.
         depth: (rows, columns) m along the view.
-
-    Returns:
-        The median over the rigid landmarks at which the image shows the head, None for too few.
+        tolerance: m from the median within which a point counts.
+        least: points that must count; None is returned with fewer.
     """
     rows, columns = depth.shape
-    pixels = np.floor(np.asarray(points)[_INDEX, :2] * (columns, rows)).astype(int)
+    pixels = np.floor(points * (columns, rows)).astype(int)
     inside = np.all((pixels >= 0) & (pixels < (columns, rows)), axis=1)
-    expected = -(_POINTS @ pose[:3, :3].T + pose[:3, 3])[inside, 2]
-    farther = depth[pixels[inside, 1], pixels[inside, 0]] - expected
-    if len(farther) < LEAST_VISIBLE:
+    across, down = pixels[inside].T
+    excess = depth[down, across] - np.broadcast_to(expected, len(points))[inside]
+    if len(excess) < least:
         return None
-    middle = float(np.median(farther))
-    ours = np.abs(farther - middle) < HEAD_DEPTH
-    return float(np.median(farther[ours])) if ours.sum() >= LEAST_VISIBLE else None
+    ours = np.abs(excess - np.median(excess)) < tolerance
+    return float(excess[ours].mean()) if ours.sum() >= least else None
 
 
 class Forecaster(Protocol):
@@ -143,6 +159,7 @@ class MouthTracker:
         self._forecaster.reset()
         self._distance: float | None = None
         self._seen, self._count = -math.inf, 0
+        self._lips, self._lip_images = 0.0, 0
 
     def update(
         self, image: NDArray[np.uint8], time: float, depth: NDArray[np.floating] | None = None
@@ -165,9 +182,32 @@ class MouthTracker:
         pose = head_pose_of_points(landmarks, size, self._fov)
         distance = -float((pose[:3, :3] @ CANONICAL_MOUTH + pose[:3, 3])[2])
         if depth is not None:
-            distance += measured_distance(landmarks, pose, depth) or 0.0
+            distance = self._measured(landmarks[:, :2], pose, distance, depth)
         track = np.vstack([mouth_centre(landmarks)[None], mouth_centre(forecast.landmarks)])
         return image_rays(track, size, self._fov) * self._smoothed(distance, time)
+
+    def _measured(
+        self,
+        points: NDArray[np.floating],
+        pose: Floats,
+        distance: float,
+        depth: NDArray[np.floating],
+    ) -> float:
+        """Distance of the mouth by a depth image: of the head, and of the lips from the head.
+
+        The lips' is the mean so far, the later ones weighing more: it is what remains while
+        something hides the mouth.
+        """
+        expected = -(_POINTS @ pose[:3, :3].T + pose[:3, 3])[:, 2]
+        farther = agreed_excess(points[_INDEX], expected, depth, HEAD_DEPTH, LEAST_RIGID)
+        if farther is None:
+            return distance + self._lips
+        distance += farther
+        lips = agreed_excess(points[list(OUTER_LIPS)], distance, depth, LIP_DEPTH, LEAST_LIPS)
+        if lips is not None and abs(lips) < LIP_DEPTH:
+            self._lip_images += 1
+            self._lips += (lips - self._lips) / min(self._lip_images, LIP_IMAGES)
+        return distance + self._lips
 
     def _smoothed(self, distance: float, time: float) -> float:
         """Mean of the distances so far, the later ones weighing more; anew after a gap."""

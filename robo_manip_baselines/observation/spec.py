@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -57,7 +57,7 @@ face detector that looks at images of ``front_close``, without or with their dep
 MEASURED = "measured"
 """Latency of the camera: as long as detector and predictor take."""
 
-CameraLatency = Annotated[int, Interval(ge=0, le=MAX_DELAY)] | Literal["measured"]
+CameraLatency = Annotated[int, Interval(ge=0, le=MAX_DELAY)] | str
 """Frames of 1/30 s, or ``MEASURED``."""
 
 
