@@ -393,8 +393,8 @@ def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]
     if world.camera_mouth and not getattr(actor, "goes_by_observation", False):
         raise RequestError(
             f"mouth_source {world.observation_spec.mouth_source}: the expert "
-            f"'{collection.expert}' of {collection.env} knows the true mouth; leave it out, or choose "
-            "an expert that goes by what is observed: servo of FeedingEnv or DrinkingEnv"
+            f"'{collection.expert}' of {collection.env} knows the true mouth; leave it out, or "
+            "choose an expert that goes by what is observed: servo of FeedingEnv or DrinkingEnv"
         )
     actor.reset()
     action = actor.act()

@@ -28,7 +28,7 @@ from robo_manip_baselines.observation import (
     MAX_HORIZON,
     TargetObservation,
 )
-from robo_manip_baselines.observation.spec import MEASURED, CameraLatency
+from robo_manip_baselines.observation.spec import CameraLatency
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
 
@@ -117,7 +117,7 @@ class CameraMouth:
 
     Args:
         model: of the cell with a face.
-        latency: frames of 1/30 s from an image to its report, or ``MEASURED``: the time that the
+        latency: frames of 1/30 s from an image to its report, or ``"measured"``: the time that the
             tracker took on this machine, which differs from run to run.
         has_depth: whether the camera measures depth, too.
         open_tracker: see `find_tracker`.
@@ -212,7 +212,7 @@ class CameraMouth:
             return
         turn = data.cam_xmat[self._camera].reshape(3, 3)
         position = found @ turn.T + data.cam_xpos[self._camera]
-        taken = self.seconds if self._latency == MEASURED else self._latency / FRAME_RATE
+        taken = self.seconds if isinstance(self._latency, str) else self._latency / FRAME_RATE
         if is_first:
             self._reports.clear()
             taken = 0.0
