@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from robo_manip_baselines.envs.mujoco.expert.servo import ARM_LAG
 from robo_manip_baselines.envs.mujoco.face.camera_mouth import CAMERA
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
+from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import WITHDRAWN
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
 from robo_manip_baselines.observation import FRAME_PERIOD
@@ -88,7 +89,7 @@ class Row:
         condition: of `CONDITIONS`.
         seed: of the episode.
         is_success, is_success_strict, completion_time, failure, face_force: see result rows.
-        steps: control steps.
+        steps: control steps, until the servo turns home without success or the episode ends.
         frames, frames_without_detection: images; None without a camera.
         errors: one `Errors` for each class of distance.
         steps_per_second: of this machine, the servo and the environment together.
@@ -121,7 +122,8 @@ def play(world: FaceEnv, condition: str, seed: int) -> Row:
     """Let the servo feed once."""
     task = task_entry(TASK)
     world.reset(seed=seed)
-    actor, metrics = task.make_expert(EXPERT, world), task.make_metrics()
+    actor: Any = task.make_expert(EXPERT, world)
+    metrics = task.make_metrics()
     actor.reset()
     view = world.data.camera(CAMERA).xmat.reshape(3, 3).copy()
     classes = len(DISTANCES) - 1
@@ -132,7 +134,8 @@ def play(world: FaceEnv, condition: str, seed: int) -> Row:
     ended, info, begun = False, {}, clock.perf_counter()
     while not ended:
         _, _, ended, _, info = world.step(actor.act())
-        ended = ended or world.step_count >= task.max_episode_steps
+        has_given_up = actor.phases_done >= WITHDRAWN and not info["is_success"]
+        ended = ended or has_given_up or world.step_count >= task.max_episode_steps
         metrics.update(info)
         force = max(force, float(info["face_force"]))
         if camera and camera.frames > frames:
