@@ -205,7 +205,7 @@ def _open(
 ) -> _Clip | None:
     if found is None:
         return None
-    import av  # slow to import
+    import av.error  # slow to import
 
     path, result = found
     outcome = result.failure.replace("_", " ") or "success"
