@@ -34,6 +34,7 @@ from robo_manip_baselines.data.files import (
 )
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.face_rows import episode_row
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     entry_of_id,
     make_env,
@@ -122,7 +123,7 @@ class EpisodeRecorder:
         self, observation: Mapping[str, NDArray[Any]], action: NDArray[Any], **columns: Any
     ) -> None:
         """Take in the state before a step, the action, and values of further columns."""
-        for name, value in (*self._world.episode_row().items(), *columns.items()):
+        for name, value in (*episode_row(self._world).items(), *columns.items()):
             self._rows[name].append(value)
         self._rows["action"].append(action)
         for key, camera in self._cameras.items():
@@ -130,7 +131,7 @@ class EpisodeRecorder:
 
     def after(self, info: dict[str, Any]) -> None:
         """Take in what is known after the step."""
-        for name, value in self._world.contact_row().items():
+        for name, value in self._world.touch.row().items():
             self._rows[name].append(value)
         self._rows["is_success"].append(info["is_success"])
         self._rows["is_success_strict"].append(info["is_success_strict"])
