@@ -171,6 +171,8 @@ class Trainer:
             device=device,
             rank=processes.rank,
             world_size=processes.world_size,
+            encoding=setup.encoding,
+            skip=settings.skip,
             state_noise=noise,
             images=images,
         )
@@ -322,7 +324,8 @@ class HeldOutLoss:
         episodes = given.indices(setup.split.validation)
         sampler = ExampleSampler(given.lengths[list(episodes)], "episode", batch_size, seed)
         data = given, setup.normalization, episodes, sampler, model
-        self._loader = BatchLoader(*data, seed=seed, device=device, images=images)
+        coding: Any = {"encoding": setup.encoding, "skip": setup.config.training.skip}
+        self._loader = BatchLoader(*data, seed=seed, device=device, images=images, **coding)
         self._steps = -(-HELD_OUT_STARTS * len(episodes) // batch_size)
         self._device, self._autocast = device, autocast
 
