@@ -215,9 +215,9 @@ def keypoints(maps: Tensor) -> Tensor:
 
 
 class DenoisingModel(PolicyModel):
-    """Network that tells, for noisy actions of a known noise level, the noise or the actions.
+    """Policy whose network tells, for noisy actions of a known level, the noise or the actions.
 
-    Initial weights are drawn from PyTorch's default generator.
+    A policy adds a `loss` and a `sample`. Initial weights come from PyTorch's default generator.
 
     Args:
         config: of the network.
@@ -230,7 +230,8 @@ class DenoisingModel(PolicyModel):
     ) -> None:
         super().__init__()
         self.chunk_size, self.n_obs_steps = config.chunk_size, config.n_obs_steps
-        self.action_size = dims.action
+        self.action_size, self.max_guidance = dims.action, config.max_guidance
+        self.strategies = ("rtc",)
         width = config.hidden_size
         self.vision = ImageEncoder(config) if dims.cameras else None
         features = dims.state + dims.cameras * 2 * config.keypoints
@@ -247,6 +248,34 @@ class DenoisingModel(PolicyModel):
         self.network = NETWORKS[config.backbone](config, dims.action + marks_prefix, dims.action)
         self.marks_prefix = marks_prefix
         self.finds_action = config.target == "action"
+
+    def sample(
+        self,
+        observed: Tensor,
+        noise: Tensor | None,
+        action: Tensor | None = None,
+        weight: Tensor | None = None,
+    ) -> Tensor:
+        """Return a chunk (B, K, A), for an embedded observation, from noise (B, Z).
+
+        With a weight (B, K) it is guided towards ``action`` (B, K, A).
+        """
+        raise NotImplementedError
+
+    def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
+        """Return normalised actions (B, K, A)."""
+        return self.sample(self.observe(state, images), noise)
+
+    def inpaint(
+        self,
+        state: Tensor,
+        images: Tensor | None,
+        noise: Tensor | None,
+        action: Tensor,
+        weight: Tensor,
+    ) -> Tensor:
+        """Return a chunk that is guided towards ``action``: real-time chunking."""
+        return self.sample(self.observe(state, images), noise, action, weight)
 
     def observe(self, state: Tensor, images: Tensor | None) -> Tensor:
         """Return the embedded observation (B, D) of (B, O, S) and (B, O, N, H, W, 3)."""
