@@ -50,7 +50,7 @@ OBSERVATIONS = {
 }
 """Name of an observation -> its options of ``bin/Train.py``."""
 
-POLICIES = ("Act", "Mlp", "Diffusion", "Flow")
+POLICIES = ("Act", "Mlp", "Diffusion", "Flow", "Sarnn")
 
 TABLE = "policies.md"
 

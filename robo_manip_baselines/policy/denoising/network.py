@@ -180,9 +180,9 @@ class ImageEncoder(nn.Module):
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, config: DenoisingConfig) -> None:
+    def __init__(self, vision: str, keypoints: int) -> None:
         super().__init__()
-        self.is_small = config.vision == "small"
+        self.is_small = vision == "small"
         if self.is_small:
             layers: list[nn.Module] = []
             for width_in, width in zip((3, *SMALL_VISION[:-1]), SMALL_VISION, strict=True):
@@ -193,7 +193,7 @@ class ImageEncoder(nn.Module):
         else:
             self.convolutions = ResNet18()
             width = self.convolutions.features
-        self.maps = nn.Conv2d(width, config.keypoints, 1)
+        self.maps = nn.Conv2d(width, keypoints, 1)
         self.register_buffer("mean", 255.0 * torch.tensor(MEAN).view(3, 1, 1), persistent=False)
         scale = 1.0 / (255.0 * torch.tensor(STD).view(3, 1, 1))
         self.register_buffer("scale", scale, persistent=False)
@@ -233,7 +233,7 @@ class DenoisingModel(PolicyModel):
         self.action_size, self.max_guidance = dims.action, config.max_guidance
         self.strategies = ("rtc",)
         width = config.hidden_size
-        self.vision = ImageEncoder(config) if dims.cameras else None
+        self.vision = ImageEncoder(config.vision, config.keypoints) if dims.cameras else None
         features = dims.state + dims.cameras * 2 * config.keypoints
         self.observation = nn.Sequential(
             nn.Linear(config.n_obs_steps * features, 2 * width),
