@@ -80,6 +80,8 @@ class TrainSettings:
         clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
             for all its frames. A policy that can read the clock releases by the clock, whether or
             not it has reached the target.
+        action_noise: standard deviation of the Gaussian noise that is added, in training, to the
+            actions, in units of each element's own (RoboManipBaselines: ``--action_aug_std``).
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
@@ -112,6 +114,7 @@ class TrainSettings:
     steps: Count | None = None
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
+    action_noise: Amount = 0.0
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
     norm: str | None = None

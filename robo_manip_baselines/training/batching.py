@@ -220,6 +220,7 @@ class BatchLoader:
         encoding: of the actions; None for targets of the joints.
         skip: control steps between two actions of a chunk, and between observations of a window.
         state_noise: added to states; None for no noise.
+        action_noise: standard deviation of the noise that is added to normalised actions.
         images: None without cameras. Not closed by the loader.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
@@ -243,6 +244,7 @@ class BatchLoader:
         encoding: ActionEncoding | None = None,
         skip: int = 1,
         state_noise: StateNoise | None = None,
+        action_noise: float = 0.0,
         images: ImageStore | None = None,
         depth: int = 4,
     ) -> None:
@@ -258,7 +260,8 @@ class BatchLoader:
             )
         require_range("depth", depth, NonNegativeInt)
         self._sampler, self._model, self._seed = sampler, model, seed
-        self._state_noise, self._encoding, self._skip = state_noise, encoding or None, skip
+        self._state_noise, self._action_noise = state_noise, action_noise
+        self._encoding, self._skip = encoding or None, skip
         self._rank, self._world_size, self._depth = rank, world_size, depth
         self._offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sampler.lengths)])
         self._rows = demonstrations.rows(episodes)  # of the images, for each of the R steps
@@ -324,33 +327,42 @@ class BatchLoader:
             windows[part],
             chunks[part],
             state_noise,
-            self._reference(windows[part, -1], state_noise),
+            self._action_change(step, part, windows[part, -1], state_noise),
             is_pad=torch.from_numpy(is_pad[part]),
             noise=noise[part],
             num_valid=torch.tensor(float((~is_pad).sum()) / self._world_size),
             num_examples=torch.tensor(count / self._world_size),
         )
 
-    def _reference(self, rows: NDArray[np.int64], state_noise: Tensor | None) -> Tensor | None:
-        """Return what is taken off normalised actions (b, K, A); None for targets of the joints.
+    def _action_change(
+        self, step: int, part: slice, rows: NDArray[np.int64], state_noise: Tensor | None
+    ) -> Tensor | None:
+        """Return what is added to normalised actions (b, K, A): noise, less their reference.
 
-        It is that of the observations with their noise: so a target relative to a posture that is
-        disturbed leads to where the demonstration went.
+        The reference is that of the observations with their noise: so a target relative to a
+        posture that is disturbed leads to where the demonstration went. None for no change.
         """
-        if not self._encoding:
-            return None
-        scale, vectors = self._normalization, self._observed[rows]
-        if state_noise is not None:
-            vectors = vectors + state_noise[:, -1].numpy() * scale.state_std
-        reference = self._encoding.reference(vectors, self._model.chunk_size)
-        return torch.from_numpy((reference / scale.action_std).astype(np.float32))
+        change: Tensor | None = None
+        shape = self._model.chunk_size, self._action.shape[1]
+        if self._action_noise:
+            size = self._sampler.batch_size, math.prod(shape)
+            drawn = self._action_noise * step_noise(self._seed, "action", step, *size)
+            change = drawn.view(-1, *shape)[part]
+        if self._encoding:
+            scale, vectors = self._normalization, self._observed[rows]
+            if state_noise is not None:
+                vectors = vectors + state_noise[:, -1].numpy() * scale.state_std
+            reference = self._encoding.reference(vectors, shape[0]) / scale.action_std
+            taken = torch.from_numpy(reference.astype(np.float32))
+            change = -taken if change is None else change - taken
+        return change
 
     def _gather(
         self,
         windows: NDArray[np.int64],
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
-        reference: Tensor | None,
+        change: Tensor | None,
         **others: Tensor,
     ) -> tuple[Batch, None]:
         """Gather rows in main memory.
@@ -363,8 +375,8 @@ class BatchLoader:
             state += state_noise
         images = None if self._images is None else torch.from_numpy(self._read_images(windows))
         action = torch.from_numpy(self._action[chunks])
-        if reference is not None:
-            action -= reference
+        if change is not None:
+            action += change
         return Batch(state=state, images=images, action=action, **others), None
 
     def _gather_on_device(
@@ -372,7 +384,7 @@ class BatchLoader:
         windows: NDArray[np.int64],
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
-        reference: Tensor | None,
+        change: Tensor | None,
         **others: Tensor,
     ) -> tuple[Batch, torch.cuda.Event]:
         """Gather rows on the device, without waiting for it."""
@@ -394,8 +406,8 @@ class BatchLoader:
             if state_noise is not None:
                 state += copied(state_noise)
             action = self._device_action[copied(torch.from_numpy(chunks))]
-            if reference is not None:
-                action -= copied(reference)
+            if change is not None:
+                action += copied(change)
             others = {name: copied(tensor) for name, tensor in others.items()}
             ready = torch.cuda.Event()
             ready.record(self._stream)

@@ -239,6 +239,7 @@ class Trainer:
             encoding=setup.encoding,
             skip=settings.skip,
             state_noise=noise,
+            action_noise=settings.action_noise,
             images=images,
         )
         self.held_out: HeldOutLoss | None = None

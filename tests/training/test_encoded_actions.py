@@ -29,6 +29,7 @@ from robo_manip_baselines.training.trainer import train
 POLICIES = {
     "Act": "--chunk_size 4 --hidden_size 8 --feedforward_size 8 --num_heads 2",
     "Mlp": "--chunk_size 4 --hidden_size 8",
+    "Sarnn": "--chunk_size 4 --hidden_size 8 --n_obs_steps 3",
     "Diffusion": "--chunk_size 4 --hidden_size 16 --num_layers 1",
     "Flow": "--chunk_size 4 --hidden_size 16 --num_layers 1",
 }
@@ -121,6 +122,27 @@ def test_noise_moves_the_posture_that_actions_are_relative_to(
         first = setup.demonstrations.offsets[episode]
         action = setup.demonstrations.action[first + start]
         np.testing.assert_allclose(found[row, 0], action, atol=1e-5)  # float32
+
+
+def test_noise_on_actions_is_normal_and_a_function_of_seed_and_step(
+    episodes: Path, tmp_path: Path
+) -> None:
+    setup = TrainSetup.load(configure(f"Mlp {POLICIES['Mlp']}", episodes, tmp_path))
+
+    def actions(step: int, noise: float, **changes: Any) -> np.ndarray:
+        given = setup.demonstrations, setup.normalization, range(4), setup.sampler
+        settings = {"seed": 3, "device": "cpu", **changes}
+        loader = BatchLoader(*given, setup.make_model(), action_noise=noise, **settings)
+        return loader.batch(step).action.numpy()
+
+    added = np.stack([actions(step, 0.2) - actions(step, 0.0) for step in range(40)])
+    # 4480 numbers: the deviation strays by 1 % of itself; five times that.
+    assert added.std() == pytest.approx(0.2, rel=0.05)
+    assert abs(added.mean()) < 5 * 0.2 / 4480**0.5
+    np.testing.assert_array_equal(actions(7, 0.2), actions(7, 0.2))
+    assert (actions(7, 0.2) != actions(7, 0.2, seed=4)).any()
+    halves = [actions(7, 0.2, rank=rank, world_size=2) for rank in range(2)]
+    np.testing.assert_array_equal(np.concatenate(halves), actions(7, 0.2))
 
 
 def test_what_cannot_be_encoded_is_refused(episodes: Path, tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from robo_manip_baselines.policy.presets import (
 )
 from robo_manip_baselines.runs.ranges import Amount, require_ranges
 
-
 VISION_PARAMETERS = {"small": 60_000, "resnet18": 11_200_000}
 """Weights of each encoder of images."""
 

@@ -68,4 +68,8 @@ class SarnnModel(PolicyModel):
         wrong = (self.next(hidden[:, :-1]) - features[:, 1:].detach()).square()
         size = max(wrong[0].numel(), 1)
         prediction = wrong.sum() / (batch.num_examples * size)
-        return {"loss": l1 + self.prediction_weight * prediction, "l1": l1, "prediction": prediction}
+        return {
+            "loss": l1 + self.prediction_weight * prediction,
+            "l1": l1,
+            "prediction": prediction,
+        }
