@@ -6,12 +6,12 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import tyro
 from annotated_types import Interval
 
-from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, require_viewer
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
@@ -126,6 +126,7 @@ class RolloutOptions:
         motion_library: File of recorded face motion, or extended, which ships, too, and has more
             people. If not given, the one that ships, or that of the demonstrations.
         workers: Processes in which environments step; with --policy, 0 steps them in the main one.
+        view: Show the episodes in MuJoCo's viewer, one after another, in real time.
         spec: Observation. With --scripted, cameras and image_size are recorded; with --policy, the
             observation is that of the checkpoint, and options are checked against it.
         corruption: --no_corruption shows the truth, whatever the checkpoint and other options say.
@@ -146,6 +147,7 @@ class RolloutOptions:
     clips: tuple[str, ...] = ()
     motion_library: Path | None = None
     workers: Processes = 2
+    view: bool = False
     spec: tyro.conf.OmitArgPrefixes[ObservationSpec] = field(default_factory=lambda: UNTRAINED)
     corruption: bool = True
     demonstration: tyro.conf.OmitArgPrefixes[ScriptedOptions] = field(
@@ -160,24 +162,46 @@ class RolloutOptions:
 
     @property
     def face_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about the face and its motion that were given.
+        """Arguments of the environment about the face and its motion that were given."""
+        return face_arguments(self)
 
-        Raises:
-            RequestError: there are no such face, motion or people.
-        """
-        from robo_manip_baselines.envs.mujoco.face import FACES
-        from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
-        from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
 
-        given = {
-            "face": self.face and require_choice("face", self.face, FACES),
-            "face_motion": self.face_motion,
-            "motion": None if self.motion is None else str(parse_motion(self.motion)),
-            "people": self.people and require_choice("people", self.people, PEOPLE),
-            "clips": self.clips,
-            "motion_library": self.motion_library and str(self.motion_library),
-        }
-        return {name: value for name, value in given.items() if value}
+class FaceOptions(Protocol):
+    """Options about the face and its motion."""
+
+    @property
+    def face(self) -> str | None: ...  # noqa: D102
+    @property
+    def face_motion(self) -> str | None: ...  # noqa: D102
+    @property
+    def motion(self) -> str | None: ...  # noqa: D102
+    @property
+    def people(self) -> str | None: ...  # noqa: D102
+    @property
+    def clips(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def motion_library(self) -> Path | None: ...  # noqa: D102
+
+
+def face_arguments(options: FaceOptions) -> dict[str, Any]:
+    """Return the arguments of the environment about the face and its motion that were given.
+
+    Raises:
+        RequestError: there are no such face, motion or people.
+    """
+    from robo_manip_baselines.envs.mujoco.face import FACES
+    from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
+    from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
+
+    given = {
+        "face": options.face and require_choice("face", options.face, FACES),
+        "face_motion": options.face_motion,
+        "motion": None if options.motion is None else str(parse_motion(options.motion)),
+        "people": options.people and require_choice("people", options.people, PEOPLE),
+        "clips": options.clips,
+        "motion_library": options.motion_library and str(options.motion_library),
+    }
+    return {name: value for name, value in given.items() if value}
 
 
 def require_consistent(options: RolloutOptions) -> None:
@@ -201,6 +225,8 @@ def require_consistent(options: RolloutOptions) -> None:
     if changed:
         wanted = "--policy" if options.scripted else "--scripted"
         raise RequestError(f"--{changed[0]} goes with {wanted}; leave it out")
+    if options.view:
+        require_viewer()
 
 
 def _changed_options(given: Any, default: Any) -> list[str]:
@@ -242,6 +268,7 @@ def to_collection(options: RolloutOptions) -> Collection:
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
+        is_watched=options.view,
     )
 
 
@@ -339,6 +366,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         device=given.device,
         precision=given.precision,
         videos=given.video,
+        is_watched=options.view,
     )
 
 

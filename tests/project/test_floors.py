@@ -93,7 +93,7 @@ def test_the_packages_meet_in_files_and_in_runs(repository: Path) -> None:
 
 
 def test_one_module_names_the_tracker_of_the_other_package(repository: Path) -> None:
-    """A reference ``module:name`` is imported when it is used (docs/decisions/0013)."""
+    """A reference ``module:name`` is imported when it is used (docs/decisions/0014)."""
     found = {
         path.relative_to(repository).as_posix()
         for path in (repository / "robo_manip_baselines").rglob("*.py")

@@ -2,7 +2,7 @@
 
 The tracker is another package's: it is named here as ``module:callable`` and imported when a
 `CameraMouth` is made, so that an environment that shows the truth needs no detector
-(``docs/decisions/0013-perception-by-name.md``).
+(``docs/decisions/0014-perception-by-name.md``).
 
 Camera frame: x right in the image, y up, the camera looks along -z; metres.
 """
