@@ -106,8 +106,9 @@ def dataset_info(folder: Path) -> dict[str, str]:
     durations = [item["num_steps"] * item["control_period"] for item in metadata]
     times = [item["completion_time"] for item in metadata if item["is_success"]]
     mixture = _mixture(metadata)
-    subjects = {item["motion_subject"] for item in metadata}
-    clips = {item["motion_clip"] for item in metadata}
+    # Episodes that were imported have no face.
+    subjects = {item["motion_subject"] for item in metadata if "motion_subject" in item}
+    clips = {item["motion_clip"] for item in metadata if "motion_clip" in item}
     return {
         "folder": str(folder),
         "demonstrations": str(len(paths)),
