@@ -30,6 +30,7 @@ from robo_manip_baselines.data.files import FAILED_FOLDER, list_failures, seed_o
 from robo_manip_baselines.data.schema import SCHEMA_VERSION
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.face_rows import episode_row
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     entry_of_id,
     make_env,
@@ -103,13 +104,13 @@ def demonstrate(
     ended = False
     while not ended:
         action = actor.act()
-        for name, value in world.episode_row().items():
+        for name, value in episode_row(world).items():
             rows[name].append(value)
         rows["action"].append(action)
         for key, camera in cameras.items():
             images[camera].append(encode_image(observation[key], codec, quality))
         observation, _, terminated, truncated, info = env.step(action)
-        for name, value in world.contact_row().items():
+        for name, value in world.touch.row().items():
             rows[name].append(value)
         rows["is_success"].append(info["is_success"])
         rows["is_success_strict"].append(info["is_success_strict"])
