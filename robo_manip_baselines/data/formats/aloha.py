@@ -120,7 +120,7 @@ def from_gripper(value: NDArray[np.float64]) -> NDArray[np.float64]:
 def aloha_arrays(episode: EpisodeReader) -> dict[str, NDArray[np.float32]]:
     """Return ``qpos``, ``qvel`` and ``action`` of an episode, (T, 14) each."""
     from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED  # the simulator
-    from robo_manip_baselines.envs.mujoco.tasks.face_env import PARKED_QPOS
+    from robo_manip_baselines.envs.mujoco.tasks.face_scene import PARKED_QPOS
 
     steps = len(episode)
 
