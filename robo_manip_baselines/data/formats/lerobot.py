@@ -224,7 +224,7 @@ class _Plan:
             request.encoding,
             (request.data_file_mb * 2**20, request.video_file_mb * 2**20),
             request.recorded,
-            chosen,
+            json.loads(json.dumps(chosen)),  # as it is read back
         )
 
     def is_written(self, out: Path) -> bool:

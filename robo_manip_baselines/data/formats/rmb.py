@@ -264,6 +264,8 @@ def _recording(file: h5py.File, path: Path) -> Recording:
             f"'{path}': time {time.shape}, measured_joint_pos {measured.shape}, command_joint_pos "
             f"{command.shape}; one or two arms of 6 joints and a gripper are read, (T, 7) or (T, 14)"
         )
+    if steps < 2 or not (np.diff(time) > 0.0).all():
+        raise RequestError(f"'{path}': {steps} steps, or time does not increase")
     by_arm = measured.reshape(steps, -1, 7)
     velocity = _velocity(file, by_arm, time)
     pose = _array(file, "measured_eef_pose")
@@ -325,7 +327,7 @@ def _velocity(
     file: h5py.File, position: NDArray[np.float64], time: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return (T, A, 7) velocities; differences of the positions where there are none."""
-    differences = np.gradient(position, time, axis=0) if len(time) > 1 else np.zeros_like(position)
+    differences = np.gradient(position, time, axis=0)
     try:
         measured = _array(file, "measured_joint_vel")
     except KeyError:
