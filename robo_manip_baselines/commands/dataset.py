@@ -271,15 +271,15 @@ class Import:
         _require_elsewhere(self.folder, self.out)
         given = None if self.cameras is None else list(self.cameras)
         read = {"rmb": import_rmb, "aloha": import_aloha}[self.format]
-        return closing_table(
-            read(self.folder, self.out, cameras=given, codec=self.image_codec)
-        ), 0
+        return closing_table(read(self.folder, self.out, cameras=given, codec=self.image_codec)), 0
 
 
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Dataset.py``."""
     example = "python bin/Dataset.py verify dataset/FeedingEnv"
     description = "Inspect, verify, plot, export and import episodes."
-    text, code = parse(Verify | Info | Plot | Export | Import, example, description=description, args=args).run()
+    text, code = parse(
+        Verify | Info | Plot | Export | Import, example, description=description, args=args
+    ).run()
     print(text)  # noqa: T201
     return code

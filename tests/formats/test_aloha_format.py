@@ -1,4 +1,4 @@
-"""ALOHA's episodes: the 14 numbers, the gripper's units, images; there and back; those of its own."""
+"""ALOHA's episodes: the 14 numbers, the gripper's units, images; there and back; its own."""
 
 from __future__ import annotations
 

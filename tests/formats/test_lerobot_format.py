@@ -1,4 +1,4 @@
-"""LeRobot datasets: the layout, checked without the code that wrote it; interruption; statistics."""
+"""LeRobot datasets: the layout, checked without the code that wrote it; interruption."""
 
 from __future__ import annotations
 
@@ -71,9 +71,11 @@ def validate(root: Path) -> dict[str, Any]:
     assert all("/" not in name for name in features)
     for item in features.values():
         assert set(item) >= {"dtype", "shape", "names"}
-        assert item["names"] is None or len(item["names"]) == item["shape"][-1] or len(
-            item["names"]
-        ) == len(item["shape"])
+        assert (
+            item["names"] is None
+            or len(item["names"]) == item["shape"][-1]
+            or len(item["names"]) == len(item["shape"])
+        )
 
     tasks = pyarrow.parquet.read_table(root / "meta/tasks.parquet")
     pandas = json.loads(tasks.schema.metadata[b"pandas"])
@@ -349,4 +351,3 @@ def test_a_missing_library_is_one_line(
     with pytest.raises(RequestError, match=r"needs pyarrow.*\[formats\]"):
         export_lerobot(one_arm, tmp_path / "dataset", REQUEST)
     assert not any(tmp_path.iterdir())
-

@@ -183,9 +183,10 @@ def test_its_own_episodes_become_demonstrations(single: bool, width: int, tmp_pa
     assert rows["episodes"] == "1, of which 1 new"
     assert verify_dataset(out) == []
     (path,) = list_episodes(out)
-    with EpisodeReader(path) as episode, h5py.File(
-        source / name if single else source / name / "main.rmb.hdf5"
-    ) as file:
+    with (
+        EpisodeReader(path) as episode,
+        h5py.File(source / name if single else source / name / "main.rmb.hdf5") as file,
+    ):
         assert episode.task.name == "ImportedEnv"
         np.testing.assert_array_equal(episode.array("action"), file["command_joint_pos"])
         by_arm = file["measured_joint_pos"][:].reshape(20, -1, 7)
@@ -256,5 +257,5 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="is no RMB episode"):
         import_rmb(tmp_path / "source", tmp_path / "out")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(RequestError, match="holds no .rmb folder"):
+    with pytest.raises(RequestError, match=r"holds no \.rmb folder"):
         import_rmb(tmp_path / "empty", tmp_path / "out")

@@ -14,10 +14,10 @@ import gymnasium
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
-from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
-from robo_manip_baselines.observation import CAMERAS, Corruption, ObservationSpec
 
 from lerobot_env_robo_manip_baselines.view import LeRobotView
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import CAMERAS, Corruption, ObservationSpec
 
 FPS = 50
 

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
+
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
 

@@ -98,7 +98,7 @@ def import_aloha(
     See `import_recordings`. Episodes that `export_aloha` wrote become what they were, but for the
     encoding of their images; others become demonstrations of `IMPORTED`.
     """
-    found = [path for path in folder.glob("episode_*.hdf5")] if folder.is_dir() else []
+    found = list(folder.glob("episode_*.hdf5")) if folder.is_dir() else []
     found.sort(key=lambda path: (len(path.stem), path.stem))  # 2 before 10
     require_sources(folder, found, "episode_*.hdf5 file")
     return import_recordings(found, out, open_aloha, kind="aloha", cameras=cameras, codec=codec)
@@ -114,7 +114,7 @@ def from_gripper(value: NDArray[np.float64]) -> NDArray[np.float64]:
     return value * (GRIPPER_OPEN - GRIPPER_CLOSED) + GRIPPER_CLOSED
 
 
-# -- writing ----------------------------------------------------------------------------------------
+# -- writing ---------------------------------------------------------------------------------------
 
 
 def aloha_arrays(episode: EpisodeReader) -> dict[str, NDArray[np.float32]]:
@@ -189,7 +189,7 @@ def _own(file: h5py.File, path: Path) -> dict[str, Any] | None:
     return parse_own_attributes(text.decode() if isinstance(text, bytes) else str(text), path)
 
 
-# -- reading ----------------------------------------------------------------------------------------
+# -- reading ---------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -217,8 +217,8 @@ def _recording(file: h5py.File, path: Path) -> Recording:
             "(T, 14): 6 joints and a gripper of the left arm, then of the right one"
         )
     steps = len(qpos)
-    time = PERIOD * np.arange(steps)
-    if "qvel" in file["observations"]:
+    time = PERIOD * np.arange(steps, dtype=np.float64)
+    if "observations/qvel" in file:
         qvel = read_whole(dataset_of(file, "observations/qvel")).astype(np.float64)
     else:
         qvel = np.gradient(qpos, time, axis=0)
@@ -252,14 +252,14 @@ def _right_poses(joints: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _own_fields(file: h5py.File) -> dict[str, NDArray[Any]]:
-    group = file[OWN_GROUP]
-    return {name: read_whole(dataset_of(file, f"{OWN_GROUP}/{name}")) for name in group}
+    group = file.get(OWN_GROUP)
+    names = map(str, group) if isinstance(group, h5py.Group) else ()
+    return {name: read_whole(dataset_of(file, f"{OWN_GROUP}/{name}")) for name in names}
 
 
 def _cameras(file: h5py.File) -> tuple[str, ...]:
-    observations = file["observations"]
-    images = observations.get("images") if isinstance(observations, h5py.Group) else None
-    return tuple(sorted(images)) if isinstance(images, h5py.Group) else ()
+    images = file.get("observations/images")
+    return tuple(sorted(map(str, images))) if isinstance(images, h5py.Group) else ()
 
 
 def _frames(file: h5py.File, path: Path) -> Frames:
@@ -274,11 +274,10 @@ def _frames(file: h5py.File, path: Path) -> Frames:
         if images.dtype != np.uint8 or images.ndim not in (2, 4) or images.shape[-1] in (1, 4):
             raise RequestError(f"'{path}': images of '{camera}' are {images.shape} {images.dtype}")
         for step in range(len(images)):
-            image = np.asarray(images[step])
-            if image.ndim == 1:
-                image = cv2.imdecode(image, cv2.IMREAD_COLOR)
-                if image is None:
-                    raise RequestError(f"'{path}': image {step} of '{camera}' is damaged")
-            yield np.ascontiguousarray(image)
+            stored = np.asarray(images[step], dtype=np.uint8)
+            image = cv2.imdecode(stored, cv2.IMREAD_COLOR) if stored.ndim == 1 else stored
+            if image is None:
+                raise RequestError(f"'{path}': image {step} of '{camera}' is damaged")
+            yield np.ascontiguousarray(image, dtype=np.uint8)
 
     return frames

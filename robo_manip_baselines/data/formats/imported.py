@@ -173,7 +173,7 @@ def _write(
     """Write one episode, unless it is there."""
     if recording.own:
         given, fields = recording.own
-        attributes = {
+        attributes: dict[str, Any] = {
             item.name: given.get(item.name)
             for item in EpisodeSchema.of(entry_of_id(given["env_id"])).attributes
             if not item.is_derived

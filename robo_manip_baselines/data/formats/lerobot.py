@@ -33,6 +33,7 @@ from robo_manip_baselines.data.formats.video import (
 )
 from robo_manip_baselines.envs.mujoco.tasks.registry import entry_of_id
 from robo_manip_baselines.observation import CAMERAS, Corruption, ObservationSpec
+from robo_manip_baselines.runs.documents import parse_json, read_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
 from robo_manip_baselines.runs.files import (
@@ -62,6 +63,9 @@ OWN_PATH = "meta/robo_manip_baselines.json"
 
 OWN_SCHEMA = "robo_manip_baselines/lerobot_export"
 OWN_VERSION = 1
+
+MANIFEST_BYTES = 2**30
+"""Largest size of that file that is read: some kB an episode."""
 
 CHUNK_SIZE = 1000
 """Files in a folder."""
@@ -224,16 +228,16 @@ class _Plan:
             request.encoding,
             (request.data_file_mb * 2**20, request.video_file_mb * 2**20),
             request.recorded,
-            json.loads(json.dumps(chosen)),  # as it is read back
+            parse_json(json.dumps(chosen), "request"),  # as it is read back
         )
 
     def is_written(self, out: Path) -> bool:
         """Return whether a folder is a finished export by this plan."""
         try:
-            found = json.loads((out / OWN_PATH).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            found = read_json(out / OWN_PATH, limit=MANIFEST_BYTES)
+        except RequestError:
             return False
-        return isinstance(found, dict) and found.get("request") == self.request
+        return found.get("request") == self.request
 
 
 def _staging(out: Path) -> Path:
@@ -244,7 +248,7 @@ def _write_dataset(given: Demonstrations, plan: _Plan, out: Path) -> None:
     """Convert the episodes that have no piece yet, then join the pieces."""
     staging = _staging(out)
     begun = staging / "request.json"
-    if begun.exists() and json.loads(begun.read_text(encoding="utf-8")) != plan.request:
+    if begun.exists() and read_json(begun) != plan.request:
         shutil.rmtree(staging)  # of other options or episodes: nobody asks for it any more
     with disk_errors(out):
         staging.mkdir(parents=True, exist_ok=True)
@@ -265,7 +269,7 @@ def _write_dataset(given: Demonstrations, plan: _Plan, out: Path) -> None:
         flush_to_disk(out.parent)
 
 
-# -- pieces -----------------------------------------------------------------------------------------
+# -- pieces ----------------------------------------------------------------------------------------
 
 
 def _write_piece(
@@ -379,7 +383,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-# -- statistics -------------------------------------------------------------------------------------
+# -- statistics ------------------------------------------------------------------------------------
 
 
 def vector_statistics(values: NDArray[Any]) -> dict[str, list[float]]:
@@ -428,7 +432,7 @@ def _quantile_name(quantile: float) -> str:
     return f"q{round(100 * quantile):02d}"
 
 
-# -- shards -----------------------------------------------------------------------------------------
+# -- shards ----------------------------------------------------------------------------------------
 
 
 def shards(sizes: Iterable[int], limit: int) -> list[int]:
@@ -456,9 +460,7 @@ def _groups(numbers: Sequence[int], pieces: Sequence[Path]) -> Iterator[tuple[in
         yield number, [p for n, p in zip(numbers, pieces, strict=True) if n == number]
 
 
-def _join_pieces(
-    given: Demonstrations, pieces: Sequence[Path], plan: _Plan, dataset: Path
-) -> None:
+def _join_pieces(given: Demonstrations, pieces: Sequence[Path], plan: _Plan, dataset: Path) -> None:
     """Write the shards and the metadata of a dataset."""
     cameras = given.spec.cameras
     keys = {camera: f"observation.images.{camera}" for camera in cameras}
@@ -473,7 +475,7 @@ def _join_pieces(
             path = dataset / _place(VIDEO_PATH, number, video_key=key)
             path.parent.mkdir(parents=True, exist_ok=True)
             join_videos([piece / f"{camera}.mp4" for piece in members], path)
-    found = [json.loads((piece / "piece.json").read_text(encoding="utf-8")) for piece in pieces]
+    found = [read_json(piece / "piece.json") for piece in pieces]
     counts = {
         camera: np.array([piece["histograms"][camera] for piece in found]) for camera in cameras
     }

@@ -122,7 +122,7 @@ def import_rmb(
     return import_recordings(found, out, open_rmb, kind="rmb", cameras=cameras, codec=codec)
 
 
-# -- writing ----------------------------------------------------------------------------------------
+# -- writing ---------------------------------------------------------------------------------------
 
 
 def _require_same(target: Path, episode: EpisodeReader) -> None:
@@ -234,7 +234,7 @@ def relative_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([way, angles], axis=-1).reshape(steps, 6 * arms)
 
 
-# -- reading ----------------------------------------------------------------------------------------
+# -- reading ---------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -261,8 +261,9 @@ def _recording(file: h5py.File, path: Path) -> Recording:
     steps, width = measured.shape
     if width not in (7, 14) or command.shape != measured.shape or time.shape != (steps,):
         raise RequestError(
-            f"'{path}': time {time.shape}, measured_joint_pos {measured.shape}, command_joint_pos "
-            f"{command.shape}; one or two arms of 6 joints and a gripper are read, (T, 7) or (T, 14)"
+            f"'{path}': time {time.shape}, measured_joint_pos {measured.shape}, "
+            f"command_joint_pos {command.shape}; one or two arms of 6 joints and a gripper are "
+            "read: (T, 7), (T, 14)"
         )
     if steps < 2 or not (np.diff(time) > 0.0).all():
         raise RequestError(f"'{path}': {steps} steps, or time does not increase")
@@ -275,11 +276,11 @@ def _recording(file: h5py.File, path: Path) -> Recording:
     if own is None:  # an exported one is unit already, and shall stay as it is
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     sides = ("left", "right")[-by_arm.shape[1] :]
-    fields = {}
+    fields: dict[str, NDArray[Any]] = {}
     if own is not None:
         fields = {
             name: read_whole(dataset_of(file, name))
-            for name in file
+            for name in map(str, file)
             if name not in _WRITTEN and not name.endswith(IMAGE)
         }
     attributes = _plain_attributes(file)
@@ -366,7 +367,9 @@ def _plain_attributes(file: h5py.File) -> dict[str, Any]:
 def _cameras(file: h5py.File, path: Path) -> tuple[str, ...]:
     if path.is_dir():
         return tuple(sorted(p.name.removesuffix(VIDEO) for p in path.glob(f"*{VIDEO}")))
-    return tuple(sorted(name.removesuffix(IMAGE) for name in file if name.endswith(IMAGE)))
+    return tuple(
+        sorted(name.removesuffix(IMAGE) for name in map(str, file) if name.endswith(IMAGE))
+    )
 
 
 def _frames(file: h5py.File, path: Path) -> Frames:
@@ -381,5 +384,3 @@ def _frames(file: h5py.File, path: Path) -> Frames:
         return iter(images)
 
     return of_video if path.is_dir() else of_file
-
-

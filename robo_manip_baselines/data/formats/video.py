@@ -184,19 +184,21 @@ class VideoReader:
 
     Args:
         path: of the file.
+        threads: of the decoder; 0 lets it choose.
 
     Raises:
         RequestError: it is no video.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, threads: int = 0) -> None:
         self.path = path
         try:
             self._container = av.open(str(path))
             self._stream: Any = self._container.streams.video[0]
         except (OSError, ValueError, IndexError) as error:
             raise RequestError(f"'{path}' is no video: {' '.join(str(error).split())}") from error
-        self._stream.thread_type = "AUTO"
+        self._stream.codec_context.thread_count = threads
+        self._stream.thread_type = "AUTO" if threads != 1 else "NONE"
         self._fps = Fraction(self._stream.average_rate or self._stream.base_rate or 0)
         if not self._fps:
             raise RequestError(f"'{path}' is no video: it has no frame rate")

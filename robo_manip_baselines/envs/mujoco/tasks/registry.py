@@ -33,8 +33,8 @@ TASKS = {
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
 
 IMPORTED = "ImportedEnv"
-"""Task of demonstrations that other programs recorded, see `imported_entry`. Policies can be trained
-on them; there is no environment to run."""
+"""Task of demonstrations that other programs recorded, see `imported_entry`: policies can be
+trained on them, and there is no environment to run."""
 
 
 @dataclass(frozen=True)
