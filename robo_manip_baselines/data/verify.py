@@ -25,6 +25,7 @@ from robo_manip_baselines.data.files import FAILED_FOLDER, list_episodes, list_f
 from robo_manip_baselines.data.schema import (
     IMAGE_GROUP,
     POLICY_ATTRIBUTES,
+    SCHEMA_VERSION,
     EpisodeSchema,
     attribute_problems,
     content_digest,
@@ -234,7 +235,11 @@ def readable_attributes(file: h5py.File, schema: EpisodeSchema) -> tuple[dict[st
     """The attributes that can be read, and what is wrong with the others."""
     attributes: dict[str, Any] = {}
     problems: list[str] = []
-    for item in schema.attributes:
+    try:
+        version = int(attribute_of(file, "schema_version"))
+    except READ_ERRORS:  # reported below
+        version = SCHEMA_VERSION
+    for item in schema.attributes_of(version, file.attrs):
         if item.name not in file.attrs:
             problems.append(f"attribute '{item.name}' is missing")
             continue
