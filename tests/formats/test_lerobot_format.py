@@ -17,8 +17,9 @@ pytest.importorskip("pyarrow", reason="the format lerobot needs the extra format
 
 import pyarrow.parquet
 
-from robo_manip_baselines.data import EpisodeReader, list_episodes
+from robo_manip_baselines.data import EpisodeReader, episode_path, list_episodes, write_episode
 from robo_manip_baselines.data.demonstrations import load_demonstrations
+from robo_manip_baselines.data.example import make_arrays, make_attributes
 from robo_manip_baselines.data.formats import lerobot
 from robo_manip_baselines.data.formats.lerobot import (
     LeRobotRequest,
@@ -351,3 +352,20 @@ def test_a_missing_library_is_one_line(
     with pytest.raises(RequestError, match=r"needs pyarrow.*\[formats\]"):
         export_lerobot(one_arm, tmp_path / "dataset", REQUEST)
     assert not any(tmp_path.iterdir())
+
+
+def test_fields_that_some_episodes_lack_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for seed in range(2):
+        arrays = make_arrays(12, seed, version=4)
+        if seed:
+            arrays["intervention"] = np.zeros(12, bool)
+        path = episode_path(tmp_path / "episodes", seed, True)
+        write_episode(path, arrays, {}, make_attributes(seed))
+    root = tmp_path / "dataset"
+    export_lerobot(tmp_path / "episodes", root, REQUEST)
+    assert "intervention: not in every episode" in caplog.text
+    features = validate(root)["features"]
+    assert "recorded.intervention" not in features
+    assert "recorded.qpos" in features

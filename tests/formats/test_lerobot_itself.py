@@ -64,9 +64,7 @@ def python(repository: Path) -> Path:
         [str(made), "-m", "pip", "install", LEROBOT, "-e", str(repository), "-e", str(plugin)],
     ):
         try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, check=False, timeout=900
-            )
+            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=900)
         except subprocess.TimeoutExpired:
             pytest.skip("LeRobot was not installed within 15 minutes")
         if done.returncode:

@@ -174,9 +174,9 @@ def _write(
     if recording.own:
         given, fields = recording.own
         attributes: dict[str, Any] = {
-            item.name: given.get(item.name)
+            item.name: given[item.name]
             for item in EpisodeSchema.of(entry_of_id(given["env_id"])).attributes
-            if not item.is_derived
+            if not item.is_derived and item.name in given
         }
     else:
         attributes, fields = _imported_attributes(recording, number, source, kind), {}

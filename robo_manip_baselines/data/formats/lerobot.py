@@ -10,6 +10,7 @@ Legend: T steps of an episode, N steps of all episodes, n elements of a feature,
 from __future__ import annotations
 
 import json
+import logging
 import math
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -49,6 +50,8 @@ from robo_manip_baselines.runs.progress import ProgressBar
 
 if TYPE_CHECKING:
     import pyarrow
+
+logger = logging.getLogger(__name__)
 
 CODEBASE_VERSION = "v3.0"
 """Version of the layout, LeRobot's name for it."""
@@ -196,7 +199,7 @@ class _Plan:
     robot_type: str
     encoding: VideoEncoding
     limits: tuple[int, int]  # bytes of a shard of data, of videos
-    recorded: bool
+    recorded: tuple[str, ...]  # fields that are exported as they are
     request: dict[str, Any]
 
     @classmethod
@@ -213,9 +216,10 @@ class _Plan:
         with EpisodeReader(given.paths[0]) as episode:
             own = episode.attributes.get("instruction")
         entry = entry_of_id(given.env_id)
+        recorded = _common_fields(given.paths) if request.recorded else ()
         chosen = {
             "spec": given.spec.to_json(),
-            "recorded": request.recorded,
+            "recorded": recorded,
             "encoding": asdict(request.encoding),
             "data_file_mb": request.data_file_mb,
             "video_file_mb": request.video_file_mb,
@@ -227,7 +231,7 @@ class _Plan:
             "vx300s" if len(given.spec.arm_names) == 1 else "bi_vx300s",
             request.encoding,
             (request.data_file_mb * 2**20, request.video_file_mb * 2**20),
-            request.recorded,
+            recorded,
             parse_json(json.dumps(chosen), "request"),  # as it is read back
         )
 
@@ -238,6 +242,22 @@ class _Plan:
         except RequestError:
             return False
         return found.get("request") == self.request
+
+
+def _common_fields(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Return the fields that all episodes hold, with the same shape of a row."""
+    shapes: list[dict[str, tuple[int, ...]]] = []
+    for path in paths:
+        with EpisodeReader(path) as episode:
+            shapes.append({name: values.shape[1:] for name, values in episode.arrays.items()})
+    common = [n for n, shape in shapes[0].items() if all(s.get(n) == shape for s in shapes)]
+    left_out = {name for found in shapes for name in found} - set(common)
+    if left_out:
+        names = ", ".join(sorted(left_out))
+        logger.warning(
+            "%s: not in every episode, or of other sizes; not exported as recorded", names
+        )
+    return tuple(common)
 
 
 def _staging(out: Path) -> Path:
@@ -311,8 +331,7 @@ def _columns(
         "next.success": success,
         "next.done": is_last,
     }
-    if plan.recorded:
-        columns |= {f"{RECORDED}{name}": values for name, values in episode.arrays.items()}
+    columns |= {f"{RECORDED}{name}": episode.array(name) for name in plan.recorded}
     columns["timestamp"] = (np.arange(steps) / plan.fps).astype(np.float32)
     columns["frame_index"] = np.arange(steps)
     return {name: values.reshape(steps, -1) for name, values in columns.items()}
