@@ -14,6 +14,7 @@ import hmac
 import http.client
 import io
 import ipaddress
+import logging
 import os
 import re
 import secrets
@@ -170,6 +171,7 @@ def serve_page(options: PageOptions, label: str) -> Iterator[tuple[viser.ViserSe
             """Refuse what a visitor may ask for: a public address of this page."""
 
     _require_free(options)
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor
     gate = Gate(options.host, options.secret)
     with _guarded(gate), contextlib.redirect_stdout(io.StringIO()):  # viser prints its address
         server = Server(options.host, options.port, label, verbose=False)
