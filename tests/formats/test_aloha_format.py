@@ -11,12 +11,14 @@ import h5py
 import numpy as np
 import pytest
 
+from robo_manip_baselines.commands.dataset import main
 from robo_manip_baselines.data import EpisodeReader, list_episodes, write_episode
 from robo_manip_baselines.data.demonstrations import load_demonstrations
 from robo_manip_baselines.data.example import make_frames
 from robo_manip_baselines.data.formats import aloha, imported
 from robo_manip_baselines.data.formats.aloha import export_aloha, import_aloha
 from robo_manip_baselines.data.verify import verify_dataset
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.runs.errors import RequestError, WriteError
 
@@ -123,6 +125,26 @@ def test_its_own_episodes_become_demonstrations(tmp_path: Path) -> None:
         np.testing.assert_array_equal(episode.frame("angle", 3), make_frames(STEPS)[3])
     spec = ObservationSpec(cameras=("top",), image_size=(24, 32), arms="both")
     assert load_demonstrations(out, spec).state.shape == (3 * STEPS, 28)
+
+
+def test_commands_take_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in range(3):
+        native(tmp_path / "source" / f"episode_{number}.hdf5")
+    out, first = tmp_path / "out", tmp_path / "out" / "episode_000000.hdf5"
+    import_aloha(tmp_path / "source", out, cameras=["top"])
+    for line in (
+        ["info", out],
+        ["verify", out],
+        ["plot", first, "--out", tmp_path / "curves.png"],
+        ["compare", first, first],
+        ["split", out, "--out", tmp_path / "parts"],
+        ["verify", tmp_path / "parts" / "train"],
+        ["export", out, tmp_path / "rmb", "--format", "rmb"],
+    ):
+        assert main([str(part) for part in line]) == 0, line
+    assert "0, in 0 clips" in capsys.readouterr().out
+    with pytest.raises(RequestError, match="without an environment to run"):
+        make_env("ImportedEnv")
 
 
 def test_compressed_images_are_read(tmp_path: Path) -> None:
