@@ -21,6 +21,9 @@ SAMPLERS = ("episode", "frame")
 PRECISIONS = ("auto", "fp32", "bf16")
 SCHEDULES = ("constant", "cosine")
 
+AUGMENTATIONS = ("none", "shift", "shift+colour")
+"""Random changes to the images of training batches."""
+
 STRATEGIES = ("synchronous", "naive", "ensemble", "rtc", "rtc_trained", "roll_forward")
 """Names of the ways to execute chunks; all but ``ensemble`` execute one chunk at a time."""
 
@@ -80,6 +83,8 @@ class TrainSettings:
         clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
             for all its frames. A policy that can read the clock releases by the clock, whether or
             not it has reached the target.
+        augment: random changes to the images in training: ``shift`` by up to 4 % of their sides,
+            ``shift+colour`` (also contrast, brightness and tint), or ``none``.
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
@@ -106,6 +111,7 @@ class TrainSettings:
     steps: Count | None = None
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
+    augment: str = "none"
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
     norm: str | None = None
@@ -117,6 +123,7 @@ class TrainSettings:
         require_choice("sampler", self.sampler, SAMPLERS)
         require_choice("precision", self.precision, PRECISIONS)
         require_choice("schedule", self.schedule, SCHEDULES)
+        require_choice("augment", self.augment, AUGMENTATIONS)
         if (self.epochs is None) == (self.steps is None):
             raise RequestError("give the budget as --epochs or as --steps, one of the two")
         require_ranges(self)

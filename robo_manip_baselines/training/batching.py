@@ -1,6 +1,6 @@
 """Training batches: sampled, and made ahead by threads in main memory or on a CUDA device.
 
-Examples and noise of each step are functions of the seed and of the step, nothing else.
+Examples, noise and changes to images are functions of the seed and of the step, nothing else.
 
 Legend: E training episodes, R steps of them, b examples of a step, O observation steps, S elements
 of the state, A elements of an action, K actions of a chunk, N cameras, H and W image height and
@@ -29,6 +29,11 @@ from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.ranges import Count, NonNegativeInt, require_range
 from robo_manip_baselines.runs.seeds import derive_seed
+from robo_manip_baselines.training.augmentation import (
+    ImageAugmentation,
+    ImageChanges,
+    change_images,
+)
 from robo_manip_baselines.training.images import ImageStore
 
 UPLOAD = 64
@@ -209,6 +214,7 @@ class BatchLoader:
         world_size: processes that share each batch.
         state_noise: added to states; None for no noise.
         images: None without cameras. Not closed by the loader.
+        augment: random changes to the images, one of ``AUGMENTATIONS``.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
     Raises:
@@ -230,6 +236,7 @@ class BatchLoader:
         world_size: int = 1,
         state_noise: StateNoise | None = None,
         images: ImageStore | None = None,
+        augment: str = "none",
         depth: int = 4,
     ) -> None:
         if not np.array_equal(demonstrations.lengths[list(episodes)], sampler.lengths):
@@ -251,6 +258,9 @@ class BatchLoader:
         self._state = normalization.normalize_state(demonstrations.state[self._rows])
         self._action = normalization.normalize_action(demonstrations.action[self._rows])
         self._images = images
+        self._augmentation: ImageAugmentation | None = None
+        if images is not None and augment != "none":
+            self._augmentation = ImageAugmentation(augment, images.shape)
         self._device = torch.device(device)
         self._stream: torch.cuda.Stream | None = None
         self._device_images: Tensor | None = None
@@ -299,12 +309,16 @@ class BatchLoader:
         if self._state_noise:
             drawn = self._state_noise.draw(self._seed, step, count * n_obs_steps)
             state_noise = None if drawn is None else drawn.view(count, n_obs_steps, -1)[part]
+        changes: ImageChanges | None = None
+        if self._augmentation:
+            changes = self._augmentation.draw(self._seed, step, count).part(part)
         gather = self._gather if self._stream is None else self._gather_on_device
         # All processes divide by the same number, the mean over the processes.
         return gather(
             windows[part],
             chunks[part],
             state_noise,
+            changes,
             is_pad=torch.from_numpy(is_pad[part]),
             noise=noise[part],
             num_valid=torch.tensor(float((~is_pad).sum()) / self._world_size),
@@ -316,6 +330,7 @@ class BatchLoader:
         windows: NDArray[np.int64],
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
+        changes: ImageChanges | None,
         **others: Tensor,
     ) -> tuple[Batch, None]:
         """Gather rows in main memory.
@@ -327,6 +342,8 @@ class BatchLoader:
         if state_noise is not None:
             state += state_noise
         images = None if self._images is None else torch.from_numpy(self._read_images(windows))
+        if images is not None and changes is not None:
+            images = change_images(images, changes)
         action = torch.from_numpy(self._action[chunks])
         return Batch(state=state, images=images, action=action, **others), None
 
@@ -335,6 +352,7 @@ class BatchLoader:
         windows: NDArray[np.int64],
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
+        changes: ImageChanges | None,
         **others: Tensor,
     ) -> tuple[Batch, torch.cuda.Event]:
         """Gather rows on the device, without waiting for it."""
@@ -352,6 +370,8 @@ class BatchLoader:
             images = None if self._device_images is None else self._device_images[rows]
             if host_images is not None:
                 images = host_images.to(self._device, non_blocking=True)
+            if images is not None and changes is not None:
+                images = change_images(images, changes.to(self._device))
             state = self._device_state[rows]
             if state_noise is not None:
                 state += copied(state_noise)

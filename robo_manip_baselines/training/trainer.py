@@ -173,6 +173,7 @@ class Trainer:
             world_size=processes.world_size,
             state_noise=noise,
             images=images,
+            augment=settings.augment,
         )
         self.held_out: HeldOutLoss | None = None
         if setup.split.validation and processes.is_main:

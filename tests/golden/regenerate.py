@@ -56,6 +56,9 @@ WATCHED = (
     "vision.backbone.layer4.1.conv2.weight",
     "vision.projection.weight",
     "vision.cameras",
+    "points.backbone.cameras.0.0.weight",
+    "points.backbone.cameras.1.6.weight",
+    "state_projection.0.weight",
     "encoder.layers.0.attention.query.weight",
     "decoder.layers.0.memory_attention.key.weight",
     "decoder.layers.2.feed_forward.narrow.weight",
@@ -98,9 +101,22 @@ def fixed_batch(has_images: bool) -> Batch:
     )
 
 
-def act_step(paper_compat: bool) -> dict[str, Any]:
+ACT_SETTINGS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper_compat": {"paper_compat": True},
+    "keypoints": {
+        "vision": "keypoints",
+        "keypoints": 8,
+        "state_layers": 1,
+        "use_cvae": False,
+        "actions_per_query": 3,
+    },
+}
+
+
+def act_step(name: str) -> dict[str, Any]:
     """Return `training_step` of ACT."""
-    model = ActModel(ActConfig(**CONFIG, paper_compat=paper_compat), DIMS)
+    model = ActModel(ActConfig(**{**CONFIG, **ACT_SETTINGS[name]}), DIMS)
     return training_step(model, fixed_batch(has_images=True), WATCHED)
 
 
@@ -222,11 +238,7 @@ def face_step(name: str) -> dict[str, Any]:
 def main() -> None:
     """Write every golden file."""
     write_json(FACE_STEP, {name: face_step(name) for name in FACE_SETTINGS})
-    golden = {
-        "default": act_step(paper_compat=False),
-        "paper_compat": act_step(paper_compat=True),
-    }
-    write_json(ACT_STEP, golden)
+    write_json(ACT_STEP, {name: act_step(name) for name in ACT_SETTINGS})
     write_json(MLP_STEP, mlp_step())
     write_json(DENOISING_STEP, {f"{p} {b}": denoising_step(p, b) for p, b in DENOISING_STEPS})
 

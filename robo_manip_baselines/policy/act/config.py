@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Interval
 
@@ -51,6 +51,12 @@ class ActConfig:
         dropout: on the residual branches and inside the feed-forward blocks in training (public
             ACT: 0.1). Attention weights are not dropped: that would need them in memory.
         pre_norm: layer normalisation before each block instead of after it (public ACT: False).
+        vision: features of the images: resnet18, one for all cameras, whose feature maps are tokens
+            (public ACT); or keypoints, three convolutions for each camera and the coordinates of
+            points that a spatial softmax finds (Finn et al. 2016; Levine et al. 2016), which
+            are observed beside the state: a fourth of a narrow ResNet's work.
+        backbone_width: channels of the first stage of the ResNet-18 (He et al. 2016: 64).
+        keypoints: P, of each camera with ``vision`` keypoints (Chi et al. 2023: 32).
         backbone_learning_rate_factor: learning rate of the ResNet-18 as a multiple of the others'
             (public ACT: 1e-5 for both, so 1); 0 keeps it as it is.
         backbone_weights: file with the state dict of a torchvision ResNet-18 to start from,
@@ -78,12 +84,19 @@ class ActConfig:
     kl_weight: Amount = 10.0
     dropout: Fraction = 0.1
     pre_norm: bool = False
+    vision: Literal["resnet18", "keypoints"] = "resnet18"
+    backbone_width: Annotated[int, Interval(ge=1, le=1024)] = 64
+    keypoints: Annotated[int, Interval(ge=1, le=4096)] = 32
     backbone_learning_rate_factor: Amount = 1.0
     backbone_weights: str | None = None
     paper_compat: bool = False
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        for name in ("backbone_width", "keypoints"):
+            # With fewer, oneDNN of PyTorch 2.13 corrupts memory on processors with AVX2 alone.
+            if getattr(self, name) % 8:
+                raise RequestError(f"{name} {getattr(self, name)}: must be a multiple of 8")
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
@@ -101,11 +114,29 @@ class ActConfig:
         count = layers * (attention + blocks) + self.decoder_layers * (2 * attention + blocks)
         if self.state_layers:
             count += (self.state_layers - 1) * forward**2 + forward * (dims.state + width)
-        if dims.cameras:
-            count += RESNET18_PARAMETERS
+        if dims.cameras and self.vision == "resnet18":
+            count += RESNET18_PARAMETERS * self.backbone_width**2 // 64**2
+            count += 8 * self.backbone_width * width
+        elif dims.cameras:
+            points = dims.cameras * self.keypoints
+            count += 75_936 * dims.cameras + 64 * points
+            count += 2 * points * (forward if self.state_layers else width)
         ends = 2 * self.latent_size + dims.state + dims.action * self.actions_per_query
         return count + width * (self.num_queries + ends)
 
+
+CPU = ActConfig(
+    chunk_size=30,
+    hidden_size=128,
+    feedforward_size=256,
+    num_heads=4,
+    encoder_layers=1,
+    decoder_layers=1,
+    actions_per_query=5,
+    state_layers=2,
+    use_cvae=False,
+    dropout=0.0,
+)
 
 PRESETS = {
     "paper": PolicyPreset(
@@ -114,21 +145,16 @@ PRESETS = {
         execution=ActionExecution(),
     ),
     "cpu": PolicyPreset(
-        config=ActConfig(
-            chunk_size=30,
-            hidden_size=128,
-            feedforward_size=256,
-            num_heads=4,
-            encoder_layers=1,
-            decoder_layers=1,
-            actions_per_query=5,
-            state_layers=2,
-            use_cvae=False,
-            dropout=0.0,
-        ),
+        config=CPU,
         training=replace(STATE_ONLY_TRAINING, steps=3000),
         execution=ActionExecution(),
         cameras=(),
         object_pose=True,
+    ),
+    "cpu_images": PolicyPreset(
+        config=replace(CPU, vision="keypoints"),
+        training=replace(STATE_ONLY_TRAINING, batch_size=16, steps=8000),
+        execution=ActionExecution(),
+        image_size=(96, 128),
     ),
 }
