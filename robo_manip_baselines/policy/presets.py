@@ -83,8 +83,10 @@ class TrainSettings:
         clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
             for all its frames. A policy that can read the clock releases by the clock, whether or
             not it has reached the target.
-        augment: random changes to the images in training: ``shift`` by up to 4 % of their sides,
-            ``shift+colour`` (also contrast, brightness and tint), or ``none``.
+        augment: random changes to the images in training: ``shift``, ``shift+colour`` (also
+            contrast, brightness and tint) or ``none``.
+        augment_shift: largest shift as a proportion of the images' sides (robomimic crops 76 of 84
+            pixels: ±4.8 %).
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
@@ -112,6 +114,7 @@ class TrainSettings:
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
     augment: str = "none"
+    augment_shift: Fraction = 0.04
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
     norm: str | None = None

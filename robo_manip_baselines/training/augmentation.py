@@ -18,9 +18,6 @@ from robo_manip_baselines.policy.presets import AUGMENTATIONS
 from robo_manip_baselines.runs.errors import require_choice
 from robo_manip_baselines.runs.seeds import derive_seed
 
-SHIFT = 0.04
-"""Largest shift as a proportion of the image's side; robomimic crops 76 of 84 pixels, ±4.8 %."""
-
 CONTRAST, BRIGHTNESS, TINT = 0.2, 0.1, 0.05
 """Largest relative change of the contrast and, of 255, of all channels and of each by itself."""
 
@@ -58,15 +55,16 @@ class ImageAugmentation:
     Args:
         kind: one of ``AUGMENTATIONS`` but ``none``.
         shape: (N, H, W, 3) of the images of an observation.
+        shift: largest shift as a proportion of their sides.
 
     Raises:
         RequestError: there is no such augmentation.
     """
 
-    def __init__(self, kind: str, shape: tuple[int, ...]) -> None:
+    def __init__(self, kind: str, shape: tuple[int, ...], shift: float) -> None:
         self.kind = require_choice("augment", kind, AUGMENTATIONS)
         self._cameras, height, width, _ = shape
-        self._limits = torch.tensor([round(SHIFT * height), round(SHIFT * width)])
+        self._limits = torch.tensor([round(shift * height), round(shift * width)])
 
     def draw(self, seed: int, step: int, count: int) -> ImageChanges:
         """Return the changes of a step to ``count`` examples."""

@@ -214,7 +214,7 @@ class BatchLoader:
         world_size: processes that share each batch.
         state_noise: added to states; None for no noise.
         images: None without cameras. Not closed by the loader.
-        augment: random changes to the images, one of ``AUGMENTATIONS``.
+        augment: random changes to the images; None for none.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
     Raises:
@@ -236,7 +236,7 @@ class BatchLoader:
         world_size: int = 1,
         state_noise: StateNoise | None = None,
         images: ImageStore | None = None,
-        augment: str = "none",
+        augment: ImageAugmentation | None = None,
         depth: int = 4,
     ) -> None:
         if not np.array_equal(demonstrations.lengths[list(episodes)], sampler.lengths):
@@ -258,9 +258,7 @@ class BatchLoader:
         self._state = normalization.normalize_state(demonstrations.state[self._rows])
         self._action = normalization.normalize_action(demonstrations.action[self._rows])
         self._images = images
-        self._augmentation: ImageAugmentation | None = None
-        if images is not None and augment != "none":
-            self._augmentation = ImageAugmentation(augment, images.shape)
+        self._augmentation = augment
         self._device = torch.device(device)
         self._stream: torch.cuda.Stream | None = None
         self._device_images: Tensor | None = None

@@ -56,8 +56,9 @@ WATCHED = (
     "vision.backbone.layer4.1.conv2.weight",
     "vision.projection.weight",
     "vision.cameras",
-    "points.backbone.cameras.0.0.weight",
-    "points.backbone.cameras.1.6.weight",
+    "small_vision.backbone.convolutions.0.0.weight",
+    "small_vision.backbone.convolutions.1.6.weight",
+    "small_vision.backbone.projections.1.0.weight",
     "state_projection.0.weight",
     "encoder.layers.0.attention.query.weight",
     "decoder.layers.0.memory_attention.key.weight",
@@ -104,9 +105,9 @@ def fixed_batch(has_images: bool) -> Batch:
 ACT_SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "paper_compat": {"paper_compat": True},
-    "keypoints": {
-        "vision": "keypoints",
-        "keypoints": 8,
+    "small_vision": {
+        "vision": "small",
+        "camera_features": 6,
         "state_layers": 1,
         "use_cvae": False,
         "actions_per_query": 3,

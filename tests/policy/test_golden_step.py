@@ -26,7 +26,7 @@ def numbers(tree: dict[str, Any], prefix: str = "") -> dict[str, float]:
     return flat
 
 
-@pytest.mark.parametrize("step", ["default", "paper_compat", "keypoints", "mlp"])
+@pytest.mark.parametrize("step", ["default", "paper_compat", "small_vision", "mlp"])
 def test_a_training_step(repository: Path, step: str) -> None:
     golden = runpy.run_path(str(repository / "tests" / "golden" / "regenerate.py"))
     if step == "mlp":

@@ -36,7 +36,7 @@ def obvious_shift(image: NDArray[np.uint8], down: int, right: int) -> NDArray[np
 
 def test_a_shift_is_a_crop_of_the_padded_image() -> None:
     images = draw_images()
-    changes = ImageAugmentation("shift", SHAPE).draw(seed=1, step=2, count=3)
+    changes = ImageAugmentation("shift", SHAPE, 0.04).draw(seed=1, step=2, count=3)
     assert changes.shift is not None
     assert changes.gain is None
     found = change_images(images, changes).numpy()
@@ -47,7 +47,7 @@ def test_a_shift_is_a_crop_of_the_padded_image() -> None:
 
 def test_colours_are_scaled_and_moved() -> None:
     images = draw_images()
-    changes = ImageAugmentation("shift+colour", SHAPE).draw(seed=1, step=2, count=3)
+    changes = ImageAugmentation("shift+colour", SHAPE, 0.04).draw(seed=1, step=2, count=3)
     assert changes.gain is not None
     assert changes.offset is not None
     found = change_images(images, ImageChanges(None, changes.gain, changes.offset)).numpy()
@@ -59,7 +59,7 @@ def test_colours_are_scaled_and_moved() -> None:
 
 
 def test_every_shift_is_as_likely_and_colours_stay_in_their_range() -> None:
-    changes = ImageAugmentation("shift+colour", SHAPE).draw(seed=0, step=0, count=4000)
+    changes = ImageAugmentation("shift+colour", SHAPE, 0.04).draw(seed=0, step=0, count=4000)
     assert changes.shift is not None
     assert changes.gain is not None
     assert changes.offset is not None
@@ -76,7 +76,7 @@ def test_every_shift_is_as_likely_and_colours_stay_in_their_range() -> None:
 
 
 def test_changes_are_functions_of_seed_and_step() -> None:
-    augmentation = ImageAugmentation("shift+colour", SHAPE)
+    augmentation = ImageAugmentation("shift+colour", SHAPE, 0.04)
     images = draw_images(8)
     whole = change_images(images, augmentation.draw(5, 7, 8))
     again = change_images(images, augmentation.draw(5, 7, 8))
@@ -91,10 +91,10 @@ def test_changes_are_functions_of_seed_and_step() -> None:
 
 def test_cameras_and_examples_are_changed_each_by_itself() -> None:
     images = draw_images(1, 1)[:, :, :1].expand(6, 1, 2, -1, -1, -1)
-    changed = change_images(images, ImageAugmentation("shift+colour", SHAPE).draw(0, 0, 6))
+    changed = change_images(images, ImageAugmentation("shift+colour", SHAPE, 0.04).draw(0, 0, 6))
     assert len(torch.unique(changed.flatten(0, 2).flatten(1), dim=0)) == 12
 
 
 def test_an_unknown_one_is_refused() -> None:
     with pytest.raises(RequestError, match=r"augment 'flip'.*none, shift, shift\+colour"):
-        ImageAugmentation("flip", SHAPE)
+        ImageAugmentation("flip", SHAPE, 0.04)

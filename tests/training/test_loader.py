@@ -206,17 +206,17 @@ def test_windows_end_with_the_example_and_begin_in_its_episode(
 
 def test_images_are_changed_for_training_only_where_asked(shown: Demonstrations) -> None:
     with ImageStore(shown) as images:
+        augment = ImageAugmentation("shift+colour", images.shape, 0.1)
         plain = make_loader(shown, images=images)
-        changed = make_loader(shown, images=images, augment="shift+colour")
+        changed = make_loader(shown, images=images, augment=augment)
         parts = [
-            make_loader(shown, images=images, augment="shift+colour", rank=rank, world_size=2)
+            make_loader(shown, images=images, augment=augment, rank=rank, world_size=2)
             for rank in range(2)
         ]
-        augmentation = ImageAugmentation("shift+colour", images.shape)
         for step in range(3):
             before = plain.batch(step)
             assert before.images is not None
-            expected = change_images(before.images, augmentation.draw(5, step, 4))
+            expected = change_images(before.images, augment.draw(5, step, 4))
             assert not torch.equal(expected, before.images)
             assert_equal(changed.batch(step), replace(before, images=expected))
             joined = [part.batch(step).images for part in parts]

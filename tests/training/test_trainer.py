@@ -59,8 +59,8 @@ RUNS = {
         "--precision fp32"
     ),
     "changed images": (
-        f"{ACT} --cameras angle top --image_size 24x32 --batch_size 2 --vision keypoints "
-        "--keypoints 8 --augment shift+colour --precision fp32"
+        f"{ACT} --cameras angle top --image_size 24x32 --batch_size 2 --vision small "
+        "--camera_features 4 --augment shift+colour --precision fp32"
     ),
     "nothing held out": f"{MLP} --validation_fraction 0",
 }

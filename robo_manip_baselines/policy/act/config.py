@@ -52,11 +52,10 @@ class ActConfig:
             ACT: 0.1). Attention weights are not dropped: that would need them in memory.
         pre_norm: layer normalisation before each block instead of after it (public ACT: False).
         vision: features of the images: resnet18, one for all cameras, whose feature maps are tokens
-            (public ACT); or keypoints, three convolutions for each camera and the coordinates of
-            points that a spatial softmax finds (Finn et al. 2016; Levine et al. 2016), which
-            are observed beside the state: a fourth of a narrow ResNet's work.
+            (public ACT); or small, four convolutions for each camera and a linear layer, whose
+            features are observed beside the state: a twentieth of a ResNet's work.
         backbone_width: channels of the first stage of the ResNet-18 (He et al. 2016: 64).
-        keypoints: P, of each camera with ``vision`` keypoints (Chi et al. 2023: 32).
+        camera_features: of each camera with ``vision`` small.
         backbone_learning_rate_factor: learning rate of the ResNet-18 as a multiple of the others'
             (public ACT: 1e-5 for both, so 1); 0 keeps it as it is.
         backbone_weights: file with the state dict of a torchvision ResNet-18 to start from,
@@ -84,19 +83,18 @@ class ActConfig:
     kl_weight: Amount = 10.0
     dropout: Fraction = 0.1
     pre_norm: bool = False
-    vision: Literal["resnet18", "keypoints"] = "resnet18"
+    vision: Literal["resnet18", "small"] = "resnet18"
     backbone_width: Annotated[int, Interval(ge=1, le=1024)] = 64
-    keypoints: Annotated[int, Interval(ge=1, le=4096)] = 32
+    camera_features: Width = 64
     backbone_learning_rate_factor: Amount = 1.0
     backbone_weights: str | None = None
     paper_compat: bool = False
 
     def __post_init__(self) -> None:
         require_ranges(self)
-        for name in ("backbone_width", "keypoints"):
+        if self.backbone_width % 8:
             # With fewer, oneDNN of PyTorch 2.13 corrupts memory on processors with AVX2 alone.
-            if getattr(self, name) % 8:
-                raise RequestError(f"{name} {getattr(self, name)}: must be a multiple of 8")
+            raise RequestError(f"backbone_width {self.backbone_width}: must be a multiple of 8")
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
@@ -118,9 +116,10 @@ class ActConfig:
             count += RESNET18_PARAMETERS * self.backbone_width**2 // 64**2
             count += 8 * self.backbone_width * width
         elif dims.cameras:
-            points = dims.cameras * self.keypoints
-            count += 75_936 * dims.cameras + 64 * points
-            count += 2 * points * (forward if self.state_layers else width)
+            cells = 48 * dims.image[0] * dims.image[1] // 16**2
+            each = 64_680 + cells * self.camera_features  # four convolutions and a linear layer
+            beside = forward if self.state_layers else width
+            count += dims.cameras * (each + self.camera_features * beside)
         ends = 2 * self.latent_size + dims.state + dims.action * self.actions_per_query
         return count + width * (self.num_queries + ends)
 
@@ -152,9 +151,12 @@ PRESETS = {
         object_pose=True,
     ),
     "cpu_images": PolicyPreset(
-        config=replace(CPU, vision="keypoints"),
-        training=replace(STATE_ONLY_TRAINING, batch_size=16, steps=8000),
-        execution=ActionExecution(),
+        config=replace(CPU, vision="small"),
+        training=replace(
+            STATE_ONLY_TRAINING, batch_size=16, steps=6000, augment="shift", augment_shift=0.02
+        ),
+        # Images are drawn and encoded for every tenth step only.
+        execution=ActionExecution(temporal_ensemble=False, n_action_steps=10),
         image_size=(96, 128),
     ),
 }

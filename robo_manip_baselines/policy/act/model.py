@@ -13,8 +13,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from robo_manip_baselines.policy.act.cameras import CameraEncoder
 from robo_manip_baselines.policy.act.config import ActConfig
-from robo_manip_baselines.policy.act.keypoints import KeypointEncoder
 from robo_manip_baselines.policy.act.resnet import (
     ResNet18,
     feature_size,
@@ -337,13 +337,13 @@ class ActModel(PolicyModel):
         self.noise_size = config.latent_size if config.use_cvae else 0
         self.cvae = CvaeEncoder(config, dims) if config.use_cvae else None
         self.latent_projection = ExactLinear(config.latent_size, width)
-        sees_points = bool(dims.cameras) and config.vision == "keypoints"
-        self.points = KeypointVision(config, dims) if sees_points else None
-        seen = 2 * config.keypoints * dims.cameras if sees_points else 0
+        is_small = bool(dims.cameras) and config.vision == "small"
+        self.small_vision = SmallVision(config, dims) if is_small else None
+        seen = config.camera_features * dims.cameras if is_small else 0
         self.state_projection = _state_projection(config, dims.state + seen)
         # Learned positions of latent and state, of unit variance like those of the sines.
         self.token_positions = nn.Parameter(torch.randn(2, width))
-        self.vision = Vision(config, dims) if dims.cameras and not sees_points else None
+        self.vision = Vision(config, dims) if dims.cameras and not is_small else None
         self.encoder = Encoder(config, config.encoder_layers)
         self.queries = nn.Parameter(torch.randn(config.num_queries, width))
         num_run = 1 if config.paper_compat else config.decoder_layers
@@ -395,7 +395,7 @@ class ActModel(PolicyModel):
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, object]]:
         """Return two groups: everything else, and the backbone with its own learning rate."""
-        vision = self.vision or self.points
+        vision = self.vision or self.small_vision
         backbone = list(vision.backbone.parameters()) if vision is not None else []
         inside = {id(parameter) for parameter in backbone}
         trained = [p for p in self.parameters() if p.requires_grad and id(p) not in inside]
@@ -407,8 +407,8 @@ class ActModel(PolicyModel):
     def _actions(self, state: Tensor, images: Tensor | None, latent: Tensor | None) -> Tensor:
         """(B, K, A) float32 from (B, 1, S), (B, 1, N, H, W, 3) and (B, Z), None being 0."""
         state = state[:, -1]
-        if self.points is not None:
-            state = torch.cat([state, self.points(images)], dim=1)
+        if self.small_vision is not None:
+            state = torch.cat([state, self.small_vision(images)], dim=1)
         if latent is None:
             latent = state.new_zeros((state.shape[0], self.config.latent_size))
         tokens = [self.latent_projection(latent)[:, None], self.state_projection(state)[:, None]]
@@ -425,7 +425,7 @@ class ActModel(PolicyModel):
 
 
 def _state_projection(config: ActConfig, size: int) -> nn.Module:
-    """Build the layers from the state and keypoints (B, size) to their token (B, D)."""
+    """Build the layers from the state and what is seen (B, size) to their token (B, D)."""
     layers: list[nn.Module] = []
     hidden = config.feedforward_size
     for _ in range(config.state_layers):
@@ -467,18 +467,18 @@ class Vision(nn.Module):
         return tokens.float(), positions.flatten(0, 1)
 
 
-class KeypointVision(nn.Module):
-    """Keypoints in the images of all cameras, to be observed beside the state."""
+class SmallVision(nn.Module):
+    """Features of the images of all cameras, to be observed beside the state."""
 
     def __init__(self, config: ActConfig, dims: PolicyDims) -> None:
         super().__init__()
         self.shape = (dims.cameras, *dims.image, 3)
-        self.backbone = KeypointEncoder(dims.cameras, config.keypoints, dims.image)
+        self.backbone = CameraEncoder(dims.cameras, config.camera_features, dims.image)
         if config.backbone_learning_rate_factor == 0.0:
             self.backbone.requires_grad_(False)
 
     def forward(self, images: Tensor | None) -> Tensor:
-        """Return (B, 2 N P) float32 coordinates, -1 to 1.
+        """Return (B, N F) float32, F being ``camera_features``.
 
         Raises:
             ValueError: the images are not (B, 1, N, H, W, 3).

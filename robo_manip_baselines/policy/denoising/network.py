@@ -12,7 +12,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from robo_manip_baselines.policy.act.keypoints import keypoints
 from robo_manip_baselines.policy.act.resnet import MEAN, STD, ResNet18
 from robo_manip_baselines.policy.denoising.config import GROUPS, DenoisingConfig
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel
@@ -204,6 +203,15 @@ class ImageEncoder(nn.Module):
         if self.is_small:  # the ResNet normalises by itself
             images = (images.permute(0, 3, 1, 2).float() - self.mean) * self.scale
         return keypoints(self.maps(self.convolutions(images)).float())
+
+
+def keypoints(maps: Tensor) -> Tensor:
+    """Return the mean places (I, 2 P), -1 to 1, of softmaxes over maps (I, P, h, w)."""
+    weight = maps.flatten(2).softmax(-1).unflatten(2, maps.shape[2:])
+    rows, columns = (torch.linspace(-1.0, 1.0, n, device=maps.device) for n in maps.shape[2:])
+    y = (weight.sum(3) * rows).sum(2)
+    x = (weight.sum(2) * columns).sum(2)
+    return torch.cat([x, y], dim=1)
 
 
 class DenoisingModel(PolicyModel):

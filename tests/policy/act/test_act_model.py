@@ -264,7 +264,7 @@ class Recorder(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"dropout": 0.1}, {"paper_compat": True}, {"vision": "keypoints"}]
+    "settings", [{"dropout": 0.1}, {"paper_compat": True}, {"vision": "small"}]
 )
 @pytest.mark.parametrize("cameras", [0, 2])
 def test_a_step_waits_for_no_number(make_model, make_batch, cameras: int, settings: dict[str, Any]):
