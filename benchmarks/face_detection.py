@@ -28,7 +28,8 @@ from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
 from robo_manip_baselines.envs.mujoco.face.motion import SEGMENT_DURATION, MotionLibrary
-from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET, PARKED_QPOS
+from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET
+from robo_manip_baselines.envs.mujoco.tasks.face_scene import PARKED_QPOS
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 
 ROOT = Path(__file__).resolve().parent.parent

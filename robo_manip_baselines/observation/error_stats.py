@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -35,6 +36,8 @@ DEFAULT_STATS = Path(__file__).with_name("assets") / "error_stats.json"
 @dataclass(frozen=True)
 class ErrorStats:
     """Statistics of a predictor's errors: forecast minus truth of the mouth centre.
+
+    Arrays are read-only, since readers of the same file share them.
 
     Attributes:
         predictor: what made the forecasts.
@@ -100,10 +103,17 @@ def load_error_stats(path: str | Path | None = None, sha256: str | None = None) 
             f"{str(sha256)[:12]}); give the file that was, as error_stats"
         )
     try:
-        rest = SCHEMA.without(parse_json_bytes(content, first, MAX_BYTES), first)
-        return _from_document(convert(rest, StoredErrorStats, first), source, digest)
+        return _parsed(content, source, digest)
     except RequestError as error:
         raise RequestError(f"{error}; {remedy}") from error
+
+
+# Every environment of a batch reads the same file, which takes a third of a second to check.
+@lru_cache(maxsize=4)
+def _parsed(content: bytes, source: Path, digest: str) -> ErrorStats:
+    first = f"error statistics '{source}'"
+    rest = SCHEMA.without(parse_json_bytes(content, first, MAX_BYTES), first)
+    return _from_document(convert(rest, StoredErrorStats, first), source, digest)
 
 
 _Pair = tuple[float, float]
@@ -182,7 +192,7 @@ class StoredErrorStats:
 def _from_document(stored: StoredErrorStats, source: Path, digest: str) -> ErrorStats:
     scale = _metres(stored.camera)
     both = np.tile(scale, len(stored.horizons))
-    return ErrorStats(
+    stats = ErrorStats(
         predictor=stored.predictor,
         stride=stored.stride_frames,
         mean_abs=np.array([row.mean_abs_m for row in stored.horizons]),
@@ -193,6 +203,15 @@ def _from_document(stored: StoredErrorStats, source: Path, digest: str) -> Error
         source=source,
         sha256=digest,
     )
+    for shared in (
+        stats.mean_abs,
+        stats.bias,
+        stats.covariance,
+        stats.autocorrelation,
+        *stats.runs,
+    ):
+        shared.setflags(write=False)
+    return stats
 
 
 def _metres(camera: StoredCamera) -> Floats:

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import pytest
 
-from robo_manip_baselines.envs.mujoco.tasks import face_env
+from robo_manip_baselines.envs.mujoco.tasks import face_env, face_scene
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
@@ -78,7 +78,7 @@ def test_without_a_display_one_line_says_so_before_anything_is_made(
 ) -> None:
     monkeypatch.setenv("DISPLAY", display)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(face_env, "build_cell", None)
+    monkeypatch.setattr(face_scene, "build_cell", None)
     with pytest.raises(RequestError, match=f"^render mode 'human': {problem}.*rgb_array") as caught:
         make_env("FeedingEnv", cameras=(), render_mode="human")
     assert "\n" not in str(caught.value)

@@ -17,6 +17,7 @@ import pytest
 from robo_manip_baselines.commands import dataset, replay, rollout
 from robo_manip_baselines.data import EpisodeReader, list_episodes
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
+from robo_manip_baselines.envs.mujoco.tasks.face_scene import FaceScene
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
 from robo_manip_baselines.policy import registry as policies
 from robo_manip_baselines.rollout.results import read_results
@@ -46,9 +47,10 @@ def test_the_page_names_methods_that_exist() -> None:
     table = PAGE.read_text().partition("| method | purpose |")[2].partition("\n\n")[0]
     names = re.findall(r"^\| `(\w+)\(", table, re.M)
     assert len(names) >= 8
-    source = inspect.getsource(FaceEnv).partition("# -- task --")[2]
-    section = source.partition("# -- indices --")[0]
-    in_section = set(re.findall(r"def (\w+)\(", section))
+    in_section: set[str] = set()
+    for base, following in ((FaceEnv, "# -- Gymnasium --"), (FaceScene, "# -- start --")):
+        source = inspect.getsource(base).partition("# -- task --")[2]
+        in_section |= set(re.findall(r"def (\w+)\(", source.partition(following)[0]))
     assert in_section - {"predicted_target"} == set(names) - {"start_attributes"}
 
 

@@ -1,44 +1,33 @@
-"""Base of every task with a moving face: the cell, the replayed head, arms, observations."""
+"""Base of every task with a moving face: its scene as a Gymnasium environment."""
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import gymnasium
-import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, CameraRenderer
-from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MOUTH_BASE, build_cell
-from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_OPEN, HOME_QPOS
-from robo_manip_baselines.envs.mujoco.face import FACES, REST_OPENING, FaceModel, add_face
-from robo_manip_baselines.envs.mujoco.face.contact import FaceTouch
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.face import FACES
 from robo_manip_baselines.envs.mujoco.face.forecasters import (
     MotionForecasters,
     require_no_waiting,
 )
-from robo_manip_baselines.envs.mujoco.face.model import rotate
-from robo_manip_baselines.envs.mujoco.face.motion import (
-    SEGMENT_DURATION,
-    MotionLibrary,
-    MotionSegment,
-)
+from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
-from robo_manip_baselines.envs.mujoco.face.physical import CompliantHead
-from robo_manip_baselines.envs.mujoco.face.proximity import FaceProximity
-from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS, FRAMES_AHEAD, FaceReplay
+from robo_manip_baselines.envs.mujoco.face.replay import FACE_MOTIONS
+from robo_manip_baselines.envs.mujoco.tasks.face_rows import safety_info, start_attributes
+from robo_manip_baselines.envs.mujoco.tasks.face_scene import FaceScene, Floats
 from robo_manip_baselines.envs.mujoco.tasks.registry import TaskEntry
 from robo_manip_baselines.observation import (
-    ARM_JOINTS,
     CAMERAS,
-    FRAME_PERIOD,
     Corruption,
     ObservationSpec,
     ObservedNames,
@@ -49,17 +38,8 @@ from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 from robo_manip_baselines.runs.ranges import MAX_SEED
 
-Floats = NDArray[np.float64]
-
 FACE_OFFSET = 0.05
 """m, largest random offset of the face along each axis (paper, Algorithm 1, line 3)."""
-
-PARKED_QPOS = (0.0, -1.8, 1.55, 0.0, -1.2, 0.0)
-"""rad, the left arm folded back over its base, out of the head's way."""
-
-REFUSAL_ANGLE = np.radians(20.0)
-"""rad by which the face has turned from world +x where it refuses: more than people who talk turn
-for long, and less than `TurnAway` does."""
 
 RENDER_CAMERA = "angle"
 """Camera of ``render()``."""
@@ -69,7 +49,7 @@ _BOUNDS = {" position": 2.0 * np.pi, " velocity": 100.0, "t_": 60.0, "": 5.0}
 """Bounds of the elements with this in their names: rad, m; rad/s, m/s; s; m, of all the rest."""
 
 
-class FaceEnv(gymnasium.Env[Any, Any]):
+class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
     """Cell with two arms and a head that moves as a recorded person moved.
 
     A task derives from it and implements the methods of the section "task": its objects, their
@@ -172,7 +152,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             raise RequestError(f"object_pose: {self.task.name} has no objects; leave it out")
         self.renders_images = True
         self.measures_proximity = False
-        self.face_kind = require_choice("face", face, FACES)
+        face = require_choice("face", face, FACES)
         self.face_motion = require_choice("face motion", face_motion, FACE_MOTIONS)
         self.motion = parse_motion(motion)
         self.people = require_choice("people", people, PEOPLE)
@@ -204,28 +184,17 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             )
         for clip in self.clips or ():
             require_choice("clip", clip, set(self.library.part(self.people).run_clip))
-        self.face = FaceModel.load()
-        scene = build_cell()
-        add_face(scene, self.face_kind)
-        self.add_objects(scene)
-        self.model: mujoco.MjModel = scene.compile()
-        self.xml_hash = hashlib.sha256(scene.to_xml().encode()).hexdigest()
-        self.data = mujoco.MjData(self.model)
-        self.substeps = round(CONTROL_PERIOD / self.model.opt.timestep)
+        super().__init__(face, spec.arm_names, self.task.names.objects)
         self.renderer = CameraRenderer(
             self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )
         self._viewer: Any = None
         self._stage = "made"
-        self._index_model()
         low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high)
         self.observation_space = make_observation_space(spec, self.task.names)
 
     # -- task -----------------------------------------------------------------------------------
-
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """Add the objects of the task to the scene before it is compiled."""
 
     def reset_task(self, rng: np.random.Generator) -> None:
         """Draw the start of the objects into ``self.data.qpos``, and reset the task's progress."""
@@ -233,9 +202,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     def object_position(self) -> Floats:
         """(O, 3) m, world: centres of the task's objects."""
         return np.empty((0, 3))
-
-    def watch_contacts(self) -> None:
-        """Read the contacts of one physics step."""
 
     def advance(self) -> tuple[float, bool]:
         """Evaluate the task after a control step; return reward and whether it has ended."""
@@ -256,30 +222,6 @@ class FaceEnv(gymnasium.Env[Any, Any]):
     def predicted_target(self) -> Floats | None:
         """(H, 3) m, world: a predictor's output for the target; None without predictions."""
         return self.predicted_mouth if self.task.predicted_field else None
-
-    # -- indices --------------------------------------------------------------------------------
-
-    def _index_model(self) -> None:
-        model, arms = self.model, self.observation_spec.arm_names
-        joints = np.array([[model.joint(f"{arm}/{j}").id for j in ARM_JOINTS] for arm in arms])
-        fingers = np.array([model.joint(f"{arm}/left_finger").id for arm in arms])
-        self._joint_qpos, self._joint_dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-        self._finger_qpos, self._finger_dof = model.jnt_qposadr[fingers], model.jnt_dofadr[fingers]
-        servos = [f"{arm}/{joint}" for arm in arms for joint in (*ARM_JOINTS, "gripper")]
-        self._actuators = np.array([model.actuator(servo).id for servo in servos])
-        self._gripper_site = model.site("right/gripper").id
-        self._mouth_site = model.site("mouth").id
-        outside = (model.geom_contype & FACE) != 0
-        self._face_geoms = frozenset(np.flatnonzero(outside).tolist())
-        self._mocap = {
-            model.body(body).name: int(model.body_mocapid[body])
-            for body in range(model.nbody)
-            if model.body_mocapid[body] >= 0
-        }
-        self.touch = FaceTouch(model, self.task.names.objects)
-        self._proximity = FaceProximity(model, self.task.names.objects)
-        is_physical = self.face_kind == "physical"
-        self._compliant_head = CompliantHead(model, self.face) if is_physical else None
 
     # -- Gymnasium ------------------------------------------------------------------------------
 
@@ -306,34 +248,13 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         if seed is not None:
             seed = require_integer("seed", seed, 0, MAX_SEED)
         super().reset(seed=seed)
-        mujoco.mj_resetData(self.model, self.data)
-        self.step_count = 0
-        self.motion_start: int | None = 0 if self.face_motion == "episode" else None
-        self.face_offset = self.np_random.uniform(-FACE_OFFSET, FACE_OFFSET, 3)
-        self.segment: MotionSegment = self.motion.draw(
+        face_offset = self.np_random.uniform(-FACE_OFFSET, FACE_OFFSET, 3)
+        segment = self.motion.draw(
             self.np_random, self.library, seed=seed, clips=self.clips, people=self.people
         )
-        self.replay = FaceReplay.lay_out(
-            self.segment,
-            MOUTH_BASE + self.face_offset,
-            self.face,
-            timestep=self.model.opt.timestep,
-            substeps=self.substeps,
-        )
-        # Of a physical face, the head moves by forces, and the mouth with it.
-        placed = ("face/torso",) if self._compliant_head else self.replay.bodies
-        self._placed = {body: self.replay.bodies[body] for body in placed}
-        self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
-        self._set_arm("right", HOME_QPOS, FINGER_OPEN)
+        self.lay_out(segment, face_offset, 0 if self.face_motion == "episode" else None)
         self.reset_task(self.np_random)
-        self._place_face(0)
-        if self._compliant_head is None:
-            position, orientation = self.replay.bodies["face/mouth"]
-            self.data.joint("face/cavity").qpos = (*position[0], *orientation[0])
-        else:
-            self._compliant_head.reset(self.data, self.replay)
-        mujoco.mj_forward(self.model, self.data)
-        self.touch.clear()
+        self.place_face()
         if self._pipeline:
             # Last, so that the world is the same as without corruption.
             drawn = int(self.np_random.integers(2**32)) if seed is None else seed
@@ -344,7 +265,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 )
         self._stage = "reset"
         self._show()
-        return self.observe(), {**self.info(), **self._safety_info()}
+        return self.observe(), {**self.info(), **safety_info(self)}
 
     def step(
         self, action: NDArray[np.float32]
@@ -360,56 +281,8 @@ class FaceEnv(gymnasium.Env[Any, Any]):
         self.simulate(action)
         reward, terminated = self.advance()
         self._show()
-        info = {**self.info(), **self._safety_info()}
+        info = {**self.info(), **safety_info(self)}
         return self.observe(), reward, terminated, False, info
-
-    def simulate(self, action: NDArray[Any]) -> None:
-        """Apply an action for one control period, the face moving at every physics step.
-
-        Raises:
-            ValueError: the action has the wrong shape or is not finite.
-        """
-        action = self._checked_action(action)
-        low, high = self.model.actuator_ctrlrange[self._actuators].T
-        self.data.ctrl[self._actuators] = np.clip(action, low, high)
-        self.touch.clear()
-        for substep in range(self.substeps):
-            self._place_face(substep + 1)
-            mujoco.mj_step(self.model, self.data)
-            self.touch.read(self.model, self.data)
-            self.watch_contacts()
-        self.step_count += 1
-        if self._compliant_head:
-            self._compliant_head.place_mouth(self.data)
-        # After a step, sites and cameras are still where they were before its integration.
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_camlight(self.model, self.data)
-
-    def _checked_action(self, action: Any) -> Floats:
-        """Return an action as float64.
-
-        Raises:
-            ValueError: it has the wrong shape, or is not finite.
-        """
-        form = f"must be ({len(self._actuators)},) finite numbers"
-        try:
-            values = np.asarray(action)
-        except (TypeError, ValueError):  # rows of different lengths, say
-            values = np.asarray(None)
-        if values.dtype.kind not in "fiu":
-            raise ValueError(f"action {' '.join(repr(action).split())}: {form}")
-        values = values.astype(np.float64)
-        if values.shape != self._actuators.shape:
-            raise ValueError(f"action of shape {values.shape}: {form}")
-        if len(bad := np.flatnonzero(~np.isfinite(values))):
-            place = f"{values[bad[0]]} in element {bad[0]}, {self.action_names[bad[0]]}"
-            raise ValueError(f"action with {place}: {form}")
-        return values
-
-    def start_motion(self) -> None:
-        """Let the motion start now, if it has been waiting."""
-        if self.motion_start is None:
-            self.motion_start = self.step_count
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the view of the camera ``angle`` as drawn, (H, W, 3) uint8; None in ``human``.
@@ -455,106 +328,7 @@ class FaceEnv(gymnasium.Env[Any, Any]):
             self._viewer = viewer.launch_passive(self.model, self.data)
         self._viewer.sync()
 
-    # -- state ----------------------------------------------------------------------------------
-
-    @property
-    def time(self) -> float:
-        """s since the start of the episode."""
-        return self.step_count * CONTROL_PERIOD
-
-    @property
-    def gripper_position(self) -> Floats:
-        """(3,) m, world: site ``right/gripper``."""
-        return self.data.site_xpos[self._gripper_site].copy()
-
-    @property
-    def gripper_orientation(self) -> Floats:
-        """(4,) wxyz, world from the site ``right/gripper``."""
-        quat = np.empty(4)
-        mujoco.mju_mat2Quat(quat, self.data.site_xmat[self._gripper_site])
-        return quat
-
-    @property
-    def action_names(self) -> list[str]:
-        """The elements of an action."""
-        return [self.model.actuator(actuator).name for actuator in self._actuators]
-
-    @property
-    def mouth_track(self) -> Floats:
-        """(K, 3) m, world: the true mouth now and 1 ... 24 frames ahead.
-
-        Of a physical face, the mouth where it is now, and where it will be if nothing touches it:
-        the recorded motion.
-        """
-        track = self.replay.mouth[self._row()].copy()
-        if self._compliant_head:
-            track[0] = self.data.site_xpos[self._mouth_site]
-        return track
-
-    @property
-    def predicted_mouth(self) -> Floats | None:
-        """(H, 3) m, world: the mouth 1 ... H frames ahead as forecast by a trained predictor.
-
-        None if the motion library holds no predictions.
-        """
-        predicted = self.replay.predicted
-        return None if predicted is None else predicted[self._row()].copy()
-
-    def mouth_at(self, time: ArrayLike) -> Floats:
-        """(..., 3) m, world: the true mouth at ``time`` (...) s of the episode, past or future.
-
-        A motion that waits for its start is taken to go on waiting. Of a physical face, it is the
-        mouth of the recorded motion, which nothing has touched.
-        """
-        start = np.inf if self.motion_start is None else self.motion_start * CONTROL_PERIOD
-        moving = np.clip(np.asarray(time, dtype=np.float64) - start, 0.0, SEGMENT_DURATION)
-        return MOUTH_BASE + self.face_offset + self.segment.displacement_at(moving)
-
-    def landmark_track(self, landmark: int) -> Floats:
-        """(K, 3) m, world: a point of the face now and 1 ... 24 frames ahead.
-
-        Landmarks are vertices of `FaceModel`, 0 to 467, numbered as MediaPipe does.
-        """
-        start = self._row() * CONTROL_PERIOD
-        displacement, orientation, jaw = self.segment.at(start + FRAMES_AHEAD)
-        mouth, jaw = MOUTH_BASE + self.face_offset + displacement, jaw + REST_OPENING
-        head, turn = self.face.body_poses(mouth, orientation, jaw)["face/head"]
-        point = self.face.deform(self.face.jaw_angle(jaw), [landmark])[:, 0]
-        track = head + rotate(turn, point)
-        if self._compliant_head:  # now, as in `mouth_track`
-            angle = self._compliant_head.jaw_angle(self.data)
-            (here,) = self.face.deform(angle, [landmark])
-            track[0] = self._compliant_head.point(self.data, here)
-        return track
-
-    def max_face_force(self) -> float:
-        """Return the largest normal force between the robot and the face now, N.
-
-        For `watch_contacts`: a control step has several physics steps. The robot has tools, too,
-        that the outside of a face stops; food does not count.
-        """
-        return self.touch.robot_force
-
-    @property
-    def jaw_opening(self) -> float:
-        """m between the inner lips."""
-        if self._compliant_head:
-            return float(self.face.jaw_at(self._compliant_head.jaw_angle(self.data)))
-        return float(self.replay.jaw[self._row()])
-
-    @property
-    def mouth_opening(self) -> Floats:
-        """(2,) m: half width and half height of the opening between the inner lips."""
-        if self._compliant_head:
-            return np.array(self.face.opening(self.jaw_opening))
-        return self.replay.opening[self._row()]
-
-    @property
-    def head_orientation(self) -> Floats:
-        """(4,) wxyz, world from head; identity for an upright face that looks along world +x."""
-        if self._compliant_head:
-            return self._compliant_head.orientation(self.data)
-        return self.data.mocap_quat[self._mocap["face/head"]].copy()
+    # -- observation ----------------------------------------------------------------------------
 
     def state(self) -> State:
         """Return the state before corruption."""
@@ -587,102 +361,12 @@ class FaceEnv(gymnasium.Env[Any, Any]):
                 observation[key] = fit_image(views[camera], spec.image_size)
         return observation
 
-    def episode_row(self) -> dict[str, Any]:
-        """Return the present row of an episode file: the state before an action."""
-        state = self.state()
-        predicted = self.predicted_mouth
-        return {
-            "time": self.time,
-            "joint_position": state.joint_position.ravel(),
-            "joint_velocity": state.joint_velocity.ravel(),
-            "gripper_position": state.gripper_position,
-            "gripper_velocity": state.gripper_velocity,
-            "end_effector_position": state.end_effector_position,
-            "end_effector_orientation": self.gripper_orientation,
-            "mouth_position": self.mouth_track,
-            **({} if predicted is None else {"predicted_mouth": predicted}),
-            "head_orientation": self.head_orientation,
-            "jaw_opening": self.jaw_opening,
-            "phase": np.int8(self.phase_names.index(self.info()["phase"])),
-            "qpos": self.data.qpos.copy(),
-            "qvel": self.data.qvel.copy(),
-            **self.task_row(),
-        }
-
-    def contact_row(self) -> dict[str, Any]:
-        """Return the fields of an episode file's row that are known after its action."""
-        return self.touch.row()
-
     def start_attributes(self) -> dict[str, Any]:
         """Return the attributes of an episode file that are known after its reset.
 
         A task with attributes of its own extends it.
         """
-        segment, arms = self.segment, self.observation_spec.arm_names
-        return {
-            "motion_clip": segment.clip,
-            "motion_subject": segment.subject,
-            "motion_start_index": segment.index,
-            "motion_start_time": segment.start / segment.fps,
-            "face_offset": self.face_offset,
-            "control_period": CONTROL_PERIOD,
-            "prediction_period": FRAME_PERIOD,
-            "phase_names": list(self.phase_names),
-            "joint_names": [f"{arm}/{joint}" for arm in arms for joint in ARM_JOINTS],
-            "action_names": self.action_names,
-            "xml_hash": self.xml_hash,
-        }
-
-    def _motion_step(self) -> int:
-        """Control steps since the motion started; 0 while it waits."""
-        return 0 if self.motion_start is None else self.step_count - self.motion_start
-
-    def _row(self) -> int:
-        """Row of the replay's arrays at the present step; held at the end of the recording."""
-        return min(self._motion_step(), len(self.replay.jaw) - 1)
-
-    def _place_face(self, substep: int) -> None:
-        moving = 0 if self.motion_start is None else substep
-        last = (len(self.replay.jaw) - 1) * self.substeps
-        row = min(self._motion_step() * self.substeps + moving, last)
-        head = self._compliant_head
-        if head and substep:
-            head.drive(self.data, row)
-            head.place_mouth(self.data)
-        for body, (position, orientation) in self._placed.items():
-            self.data.mocap_pos[self._mocap[body]] = position[row]
-            self.data.mocap_quat[self._mocap[body]] = orientation[row]
-
-    def _safety_info(self) -> dict[str, Any]:
-        near = None
-        if self.measures_proximity:
-            near = self._proximity.measure(self.model, self.data, self.touch.pairs)
-        return {
-            "face_contacts": self.touch.contacts,
-            "face_proximity": near,
-            "is_refusing": self._is_refusing(),
-        }
-
-    def _is_refusing(self) -> bool | None:
-        """Return True while a head that refuses is turned away; None where it never refuses."""
-        if not self.motion.refuses:
-            return None
-        return bool(facing_angle(self.head_orientation) > REFUSAL_ANGLE)
-
-    def _set_arm(self, arm: str, joints: Sequence[float], finger: float) -> None:
-        for joint, angle in zip(ARM_JOINTS, joints, strict=True):
-            self.data.joint(f"{arm}/{joint}").qpos = angle
-            self.data.actuator(f"{arm}/{joint}").ctrl = angle
-        self.data.joint(f"{arm}/left_finger").qpos = finger
-        sign = np.sign(self.model.joint(f"{arm}/right_finger").range.sum())
-        self.data.joint(f"{arm}/right_finger").qpos = sign * finger
-        self.data.actuator(f"{arm}/gripper").ctrl = finger
-
-
-def facing_angle(orientation: ArrayLike) -> Floats:
-    """Return the angle (...) rad between the face's normal and world +x, given (..., 4) wxyz."""
-    w, x, y, z = np.moveaxis(np.asarray(orientation, dtype=np.float64), -1, 0)
-    return np.arccos(np.clip(w**2 + x**2 - y**2 - z**2, -1.0, 1.0))
+        return start_attributes(self)
 
 
 def world_of(env: gymnasium.Env[Any, Any]) -> FaceEnv:
