@@ -38,9 +38,10 @@ BLIND = PolicyDims(state=5, action=3, cameras=0, image=(40, 70))
         (
             PolicyDims(14, 7, 3, (480, 640)),
             {"backbone_width": 16},
-            # a sixteenth of the convolutions but the first, a fourth of that; a narrower projection
-            83_916_935 - 11_166_912 + 700_896 - 2_400 - 384 * 512,
-            83_916_935 - 11_166_912 + 700_896 - 2_400 - 384 * 512,
+            # 11,166,912 weights of a ResNet-18 become 699,696, and 384 features of it less are
+            # projected to 512.
+            83_916_935 - 11_166_912 + 699_696 - 384 * 512,
+            83_916_935 - 11_166_912 + 699_696 - 384 * 512,
         ),
         # 90 queries of 512 less, and 9 × 7 more outputs of 512 + 1 weights.
         (PolicyDims(14, 7, 3, (480, 640)), {"actions_per_query": 10}, 83_903_174, 83_903_174),
@@ -314,7 +315,7 @@ def test_what_is_saved_builds_the_same_network(make_model, make_batch):
 @pytest.mark.long
 def test_it_starts_from_given_weights(make_model, tmp_path):
     path = tmp_path / "resnet18.safetensors"
-    state = ResNet18().state_dict()
+    state = ResNet18(8).state_dict()
     save_file(state, path)
     model = make_model(backbone_weights=str(path))
     loaded = model.vision.backbone.state_dict()
