@@ -83,6 +83,8 @@ class TrainSettings:
         clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
             for all its frames. A policy that can read the clock releases by the clock, whether or
             not it has reached the target.
+        action_noise: standard deviation of the Gaussian noise that is added, in training, to the
+            actions, in units of each element's own (RoboManipBaselines: ``--action_aug_std``).
         augment: random changes to the images in training: ``shift``, ``shift+colour`` (also
             contrast, brightness and tint) or ``none``.
         augment_shift: largest shift as a proportion of the images' sides (robomimic crops 76 of 84
@@ -93,6 +95,12 @@ class TrainSettings:
         norm: normalisation of states and actions, ``mean_std``, ``min_max`` (to [-1, 1]),
             ``action_min_max`` (that of actions, the other of states) or ``none``; the policy's own
             if not given.
+        relative_actions: whether joint targets are predicted relative to the observed posture; the
+            gripper's stay as they are.
+        skip: control steps between two actions of a chunk, and between two observations of a
+            window (RoboManipBaselines: ``--skip``); between two actions, targets are interpolated.
+        early_stopping: validations without a smaller loss on the episodes held out after which the
+            training ends; 0 for none. The checkpoint of the smallest loss is kept in ``best``.
         precision: ``fp32``, ``bf16`` (autocast; losses and norms stay fp32), or ``auto``.
         compile: whether to use ``torch.compile``.
         cuda_graph: whether a single process on a CUDA device records its step once and replays it,
@@ -113,11 +121,15 @@ class TrainSettings:
     steps: Count | None = None
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
+    action_noise: Amount = 0.0
     augment: str = "none"
     augment_shift: Fraction = 0.04
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
     norm: str | None = None
+    relative_actions: bool = False
+    skip: Annotated[int, Interval(ge=1, le=1000)] = 1
+    early_stopping: NonNegativeInt = 0
     precision: str = "auto"
     compile: bool = False
     cuda_graph: bool = True
@@ -130,6 +142,11 @@ class TrainSettings:
         if (self.epochs is None) == (self.steps is None):
             raise RequestError("give the budget as --epochs or as --steps, one of the two")
         require_ranges(self)
+        if self.early_stopping and not self.validation_fraction:
+            raise RequestError(
+                f"early_stopping {self.early_stopping}: no episodes are held out to stop by; give "
+                "a --validation_fraction, for example 0.1"
+            )
 
 
 @dataclass(frozen=True)

@@ -266,7 +266,7 @@ def test_run_folders(line: str, folder: str) -> None:
         ("act", ["unknown policy 'act'", "mean 'Act'"]),
         (
             "Act --preset papre",
-            ["unknown preset 'papre'", "mean 'paper'", "valid: cpu, cpu_images, paper"],
+            ["unknown preset 'papre'", "mean 'paper'", "cpu, cpu_images, paper"],
         ),
         ("Act --chunk_siez 3", ["'--chunk_siez'", "mean '--chunk_size'"]),
         ("Mlp --kl_weight 3", ["unknown option '--kl_weight'"]),

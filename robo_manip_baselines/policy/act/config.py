@@ -124,7 +124,7 @@ class ActConfig:
         return count + width * (self.num_queries + ends)
 
 
-CPU = ActConfig(
+_SMALL = ActConfig(
     chunk_size=30,
     hidden_size=128,
     feedforward_size=256,
@@ -136,6 +136,7 @@ CPU = ActConfig(
     use_cvae=False,
     dropout=0.0,
 )
+"""Sizes in the presets for a processor without a GPU."""
 
 PRESETS = {
     "paper": PolicyPreset(
@@ -144,14 +145,14 @@ PRESETS = {
         execution=ActionExecution(),
     ),
     "cpu": PolicyPreset(
-        config=CPU,
+        config=_SMALL,
         training=replace(STATE_ONLY_TRAINING, steps=3000),
         execution=ActionExecution(),
         cameras=(),
         object_pose=True,
     ),
     "cpu_images": PolicyPreset(
-        config=replace(CPU, vision="small"),
+        config=replace(_SMALL, vision="small"),
         training=replace(
             STATE_ONLY_TRAINING, batch_size=16, steps=6000, augment="shift", augment_shift=0.02
         ),

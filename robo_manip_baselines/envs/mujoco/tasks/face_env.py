@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -68,7 +69,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
     ``turn_away`` |
 
     Args:
-        obs, horizon, cameras, image_size, object_pose, arms, relative: see `ObservationSpec`.
+        obs, horizon, cameras, image_size, object_pose, arms, relative, mouth_frame, mouth_time: see
+            `ObservationSpec`.
         render_size: height and width at which cameras are drawn, before `fit_image` makes the
             images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
@@ -118,6 +120,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         render_size: tuple[int, int] | None = None,
         object_pose: bool = False,
         relative: bool = False,
+        mouth_frame: str = "none",
+        mouth_time: str = "now",
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
         face: str = "visual",
@@ -143,6 +147,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             render_size=render_size,
             object_pose=object_pose,
             relative=relative,
+            mouth_frame=mouth_frame,
+            mouth_time=mouth_time,
             arms=arms,
             corruption=_make_corruption(corruption),
         )
@@ -189,6 +195,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )
         self._viewer: Any = None
+        self._shown_at = 0.0
         self._stage = "made"
         low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high)
@@ -319,14 +326,19 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded(f"{method}() before reset(): call reset() first")
 
     def _show(self) -> None:
-        """Show the present state in MuJoCo's viewer, in mode ``human``."""
+        """Show the present state in MuJoCo's viewer, in mode ``human``, no faster than in life."""
         if self.render_mode != "human":
             return
         if self._viewer is None:
             from mujoco import viewer  # opens a display's libraries
 
             self._viewer = viewer.launch_passive(self.model, self.data)
+        if not self._viewer.is_running():  # the person has closed its window
+            return
         self._viewer.sync()
+        # From one frame to the next, so that a slow step is not followed by hasty ones.
+        time.sleep(max(0.0, self._shown_at + CONTROL_PERIOD - time.monotonic()))
+        self._shown_at = time.monotonic()
 
     # -- observation ----------------------------------------------------------------------------
 
