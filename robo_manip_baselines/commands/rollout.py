@@ -119,6 +119,8 @@ class RolloutOptions:
         people: People who move: all, or train or test for demonstrations and evaluation with
             different people. If not given, all, and test for a policy that learnt from train.
         clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
+        utensil: What brings the food in FeedingEnv: gripper or spoon. If not given, gripper, or as
+            in the demonstrations of the policy.
         motion_library: File of recorded face motion, or extended, which ships, too, and has more
             people. If not given, the one that ships, or that of the demonstrations.
         workers: Processes in which environments step; with --policy, 0 steps them in the main one.
@@ -140,6 +142,7 @@ class RolloutOptions:
     motion: str | None = None
     people: str | None = None
     clips: tuple[str, ...] = ()
+    utensil: str | None = None
     motion_library: Path | None = None
     workers: Processes = 2
     spec: tyro.conf.OmitArgPrefixes[ObservationSpec] = field(default_factory=lambda: UNTRAINED)
@@ -155,11 +158,11 @@ class RolloutOptions:
         return range(start, start + self.num_episodes)
 
     @property
-    def face_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about the face and its motion that were given.
+    def env_arguments(self) -> dict[str, Any]:
+        """Arguments of the environment about face, motion and utensil that were given.
 
         Raises:
-            RequestError: there are no such face, motion or people.
+            RequestError: there are no such face, motion, people or utensil.
         """
         from robo_manip_baselines.envs.mujoco.face import FACES
         from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
@@ -171,6 +174,8 @@ class RolloutOptions:
             "motion": None if self.motion is None else str(parse_motion(self.motion)),
             "people": self.people and require_choice("people", self.people, PEOPLE),
             "clips": self.clips,
+            "utensil": self.utensil
+            and task_entry(self.env).require_argument("utensil", self.utensil),
             "motion_library": self.motion_library and str(self.motion_library),
         }
         return {name: value for name, value in given.items() if value}
@@ -232,7 +237,7 @@ def to_collection(options: RolloutOptions) -> Collection:
         out=options.out or Path("dataset") / options.env,
         expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
         seeds=options.seeds(first=0),
-        env_kwargs={**env_kwargs, "face_motion": "episode", **options.face_arguments},
+        env_kwargs={**env_kwargs, "face_motion": "episode", **options.env_arguments},
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
@@ -318,7 +323,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         checkpoint=given.checkpoint,
         seeds=options.seeds(FIRST_SEED),
         out=options.out,
-        env_kwargs=options.face_arguments,
+        env_kwargs=options.env_arguments,
         corruption=None if corruption == trained.corruption else corruption,
         temporal_ensemble=given.temporal_ensemble,
         n_action_steps=given.n_action_steps,

@@ -184,7 +184,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             )
         for clip in self.clips or ():
             require_choice("clip", clip, set(self.library.part(self.people).run_clip))
-        super().__init__(face, spec.arm_names, self.task.names.objects)
+        super().__init__(face, spec.arm_names, (*self.task.names.objects, *self.tools))
         self.renderer = CameraRenderer(
             self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )

@@ -46,6 +46,9 @@ class FaceScene:
         touch: contacts of the face in the last control step.
     """
 
+    tools: tuple[str, ...] = ()
+    """Bodies of the robot that count by themselves where a face is touched."""
+
     def __init__(self, face_kind: str, arms: Sequence[str], objects: Sequence[str]) -> None:
         self.face_kind = face_kind
         self.face = FaceModel.load()
