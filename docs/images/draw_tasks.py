@@ -35,7 +35,7 @@ class Picture:
 
     env: str
     seed: int
-    until: Callable[[Any], bool]
+    until: Callable[[Any], Any]
     look_at: Callable[[Any], NDArray[np.float64]]
     distance: float
     kwargs: Mapping[str, Any] = field(default_factory=dict)

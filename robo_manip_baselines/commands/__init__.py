@@ -45,3 +45,13 @@ def run_dataset() -> NoReturn:
 def run_replay() -> NoReturn:
     """Run ``rmb-replay``."""
     run("replay")
+
+
+def run_teleop() -> NoReturn:
+    """Run ``rmb-teleop``."""
+    run("teleop")
+
+
+def run_tasks() -> NoReturn:
+    """Run ``rmb-tasks``."""
+    run("tasks")

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import tyro
 from annotated_types import Interval
@@ -159,26 +159,53 @@ class RolloutOptions:
 
     @property
     def env_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about face, motion and utensil that were given.
+        """Arguments of the environment that were given: of the face, and of the task alone.
 
         Raises:
-            RequestError: there are no such face, motion, people or utensil.
+            RequestError: one is not valid, or the task has no such argument.
         """
-        from robo_manip_baselines.envs.mujoco.face import FACES
-        from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
-        from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
+        given = face_arguments(self)
+        if self.utensil is not None:
+            given["utensil"] = task_entry(self.env).require_argument("utensil", self.utensil)
+        return given
 
-        given = {
-            "face": self.face and require_choice("face", self.face, FACES),
-            "face_motion": self.face_motion,
-            "motion": None if self.motion is None else str(parse_motion(self.motion)),
-            "people": self.people and require_choice("people", self.people, PEOPLE),
-            "clips": self.clips,
-            "utensil": self.utensil
-            and task_entry(self.env).require_argument("utensil", self.utensil),
-            "motion_library": self.motion_library and str(self.motion_library),
-        }
-        return {name: value for name, value in given.items() if value}
+
+class FaceOptions(Protocol):
+    """Options about the face and its motion."""
+
+    @property
+    def face(self) -> str | None: ...  # noqa: D102
+    @property
+    def face_motion(self) -> str | None: ...  # noqa: D102
+    @property
+    def motion(self) -> str | None: ...  # noqa: D102
+    @property
+    def people(self) -> str | None: ...  # noqa: D102
+    @property
+    def clips(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def motion_library(self) -> Path | None: ...  # noqa: D102
+
+
+def face_arguments(options: FaceOptions) -> dict[str, Any]:
+    """Return the arguments of the environment about the face and its motion that were given.
+
+    Raises:
+        RequestError: there are no such face, motion or people.
+    """
+    from robo_manip_baselines.envs.mujoco.face import FACES
+    from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
+    from robo_manip_baselines.envs.mujoco.face.people import PEOPLE
+
+    given = {
+        "face": options.face and require_choice("face", options.face, FACES),
+        "face_motion": options.face_motion,
+        "motion": None if options.motion is None else str(parse_motion(options.motion)),
+        "people": options.people and require_choice("people", options.people, PEOPLE),
+        "clips": options.clips,
+        "motion_library": options.motion_library and str(options.motion_library),
+    }
+    return {name: value for name, value in given.items() if value}
 
 
 def require_consistent(options: RolloutOptions) -> None:

@@ -88,7 +88,9 @@ class EpisodeReader:
             self.schema = EpisodeSchema.of(self.task)
             self.attributes = {
                 item.name: loaded_attribute(item, attribute_of(self._file, item.name))
-                for item in self.schema.attributes
+                for item in self.schema.attributes_of(
+                    int(attribute_of(self._file, "schema_version")), self._file.attrs
+                )
             }
             if problems := attribute_problems(self.task, self.attributes):
                 raise ValueError(problems[0])
@@ -329,7 +331,8 @@ def write_episode(
             widened.
         images: camera -> T frames, each from `encode_image` with the codec that
             ``attributes["image_codec"]`` names. Empty without cameras.
-        attributes: every attribute of the schema that is not derived.
+        attributes: every attribute of the schema that is not derived, optional ones where they are
+            known.
 
     Returns:
         ``path``.
@@ -355,8 +358,8 @@ def write_episode(
         raise ValueError(f"episode for '{path}': {'; '.join(problems)}")
     stored["content_sha256"] = stored_text(content_digest(schema, fields, checksums, loaded))
     with atomic_hdf5(path, _HDF5_FORMAT) as file:
-        for item in schema.attributes:
-            file.attrs[item.name] = stored[item.name]
+        for name, value in stored.items():
+            file.attrs[name] = value
         for field in schema.fields:
             if field.name in fields:
                 _write_array(file, field.name, fields[field.name])
@@ -395,7 +398,8 @@ def _checked_attributes(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Both forms of all attributes: as HDF5 keeps them, and as they are read back."""
     given = {item.name for item in schema.attributes if not item.is_derived}
-    problems = [f"attribute '{name}' is missing" for name in sorted(given - set(attributes))]
+    needed = {item.name for item in schema.attributes if not item.is_optional} & given
+    problems = [f"attribute '{name}' is missing" for name in sorted(needed - set(attributes))]
     problems += [f"attribute '{name}' is not for the caller" for name in set(attributes) - given]
     if problems:
         raise ValueError(f"these attributes are no episode's: {'; '.join(problems)}")
@@ -405,15 +409,16 @@ def _checked_attributes(
         **attributes,
         "schema": SCHEMA,
         "schema_version": schema.version_of(
-            {name: values.shape for name, values in fields.items()}
+            {name: values.shape for name, values in fields.items()}, attributes
         ),
         "content_sha256": "",
         "num_steps": num_steps,
         "cameras": sorted(images),
         "image_size": _image_size(images, codec, num_steps),
     }
-    stored = {item.name: stored_attribute(item, values[item.name]) for item in schema.attributes}
-    loaded = {item.name: loaded_attribute(item, stored[item.name]) for item in schema.attributes}
+    items = [item for item in schema.attributes if item.name in values]
+    stored = {item.name: stored_attribute(item, values[item.name]) for item in items}
+    loaded = {item.name: loaded_attribute(item, stored[item.name]) for item in items}
     return stored, loaded
 
 

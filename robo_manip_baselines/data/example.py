@@ -53,7 +53,7 @@ def make_arrays(
         if field.dtype == "bool":
             values = values > 0
         arrays[field.name] = values.astype(field.dtype)
-    optional = [field.name for field in schema.fields if field.is_optional]
+    optional = [item.name for item in schema.fields if item.is_optional and item.since <= version]
     present = optional if version > 3 else ()
     return {name: arrays[name] for name in schema.fields_of(version, present)}
 

@@ -9,6 +9,8 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import remove_temporaries
 
 FAILED_FOLDER = "failed"
+UNRENDERED_FOLDER = "unrendered"
+"""Episodes of teleoperation whose images have not been drawn yet."""
 _EPISODE_NAME = re.compile(r"episode_(\d{6,})\.hdf5")
 
 

@@ -34,11 +34,15 @@ from robo_manip_baselines.runs.images import CODECS, MAX_SIDE
 from robo_manip_baselines.runs.npz import add_array
 
 SCHEMA = "robo_manip_baselines/episode"
-SCHEMA_VERSION = 4
-READABLE_VERSIONS = (1, 2, 3, 4)
+SCHEMA_VERSION = 5
+READABLE_VERSIONS = (1, 2, 3, 4, 5)
 """A file has the lowest version that describes it: 2 added ``predicted_mouth``, 3 the truth more
 than 5 frames ahead, and other tasks than feeding, whose fields and attributes are those of the task
-that ``env_id`` names, 4 forces on the face, ``region_force`` and ``region_impulse``."""
+that ``env_id`` names, 4 forces on the face, ``region_force`` and ``region_impulse``, 5
+teleoperation: ``source`` and the attributes beside it, and ``intervention``."""
+
+TELEOP = "teleop"
+"""Value of the attribute ``source`` of an episode in which a person steered."""
 
 OLD_FRAMES = 6
 """K of files of versions 1 and 2: the truth now and 1 ... 5 frames ahead."""
@@ -135,6 +139,14 @@ _OUTCOME_FIELDS = (
         "Whether the strict condition held after this row's action",
         dtype="bool",
     ),
+    Field(
+        "intervention",
+        ("T",),
+        "Whether a person, and not the policy, chose this row's action; only where both may act",
+        dtype="bool",
+        since=5,
+        is_optional=True,
+    ),
     Field("qpos", ("T", "Q"), "Simulator positions, all of them", "m, rad, 1", "joint"),
     Field("qvel", ("T", "V"), "Simulator velocities, all of them", "m/s, rad/s", "joint"),
 )
@@ -173,6 +185,37 @@ _RECORDING_ATTRIBUTES = (
         "json",
         "Height and width of every image, in pixels; [0, 0] without cameras",
         is_derived=True,
+    ),
+    Attribute(
+        "source",
+        "text",
+        f"`{TELEOP}` where a person steered; absent where a scripted expert did",
+        since=5,
+        is_optional=True,
+    ),
+    Attribute("device", "text", "Device of the person, likewise", since=5, is_optional=True),
+    Attribute(
+        "loop_rate",
+        "float",
+        "Control steps a second while it was recorded, in Hz, likewise; NaN where nothing kept "
+        "time",
+        since=5,
+        is_optional=True,
+    ),
+    Attribute(
+        "missed_deadlines",
+        "int",
+        "Control steps that ended later than they should have, likewise",
+        since=5,
+        is_optional=True,
+    ),
+    Attribute(
+        "policy",
+        "json",
+        "Policy that acted where `intervention` is false: its name, and the SHA-256 of its "
+        "weights; absent where none may act",
+        since=5,
+        is_optional=True,
     ),
 )
 """Attributes of every episode, after those of the task."""
@@ -213,15 +256,19 @@ class EpisodeSchema:
         """Name -> attribute."""
         return {item.name: item for item in self.attributes}
 
-    def version_of(self, shapes: Mapping[str, tuple[int, ...]]) -> int:
-        """Return the schema version of a file whose fields have these names and shapes."""
+    def version_of(
+        self, shapes: Mapping[str, tuple[int, ...]], attributes: Iterable[str] = ()
+    ) -> int:
+        """Return the schema version of a file with fields of these shapes, and these attributes."""
         fields = [(self.by_name[name], shape) for name, shape in shapes.items()]
         is_long = any(
             symbol == "K" and size > OLD_FRAMES
             for field, shape in fields
             for symbol, size in zip(field.shape, shape, strict=True)
         )
-        return max([self.version, 3 if is_long else 1, *(field.since for field, _ in fields)])
+        since = [field.since for field, _ in fields]
+        since += [self.attribute_by_name[name].since for name in attributes]
+        return max([self.version, 3 if is_long else 1, *since])
 
     def fields_of(self, version: int, present: Iterable[str] = ()) -> tuple[str, ...]:
         """Return the names of the fields that a file of a schema version holds, or should.
@@ -233,6 +280,18 @@ class EpisodeSchema:
             item.name
             for item in self.fields
             if (item.name in found if item.is_optional and version > 2 else item.since <= version)
+        )
+
+    def attributes_of(self, version: int, present: Iterable[str]) -> tuple[Attribute, ...]:
+        """Return the attributes that a file of a schema version holds, or should.
+
+        Optional ones count if they are among the names ``present`` in it.
+        """
+        found = set(present)
+        return tuple(
+            item
+            for item in self.attributes
+            if item.since <= version and (not item.is_optional or item.name in found)
         )
 
 
@@ -311,7 +370,8 @@ def content_digest(
         schema: of the task.
         arrays: every field of the table that the episode has.
         checksums: camera -> (T,) uint32, the CRC-32 of its encoded frames.
-        attributes: every attribute as `loaded_attribute` gives it; ``content_sha256`` is skipped.
+        attributes: every attribute that the episode has, as `loaded_attribute` gives it;
+            ``content_sha256`` is skipped.
 
     Returns:
         64 hexadecimal digits.
@@ -324,7 +384,7 @@ def content_digest(
     for camera in sorted(checksums):
         add_array(digest, camera, np.asarray(checksums[camera], dtype=np.uint32))
     for item in schema.attributes:
-        if item.name != "content_sha256":
+        if item.name in attributes and item.name != "content_sha256":
             digest.update(f"{item.name}={_canonical(attributes[item.name])}\n".encode())
     return digest.hexdigest()
 
@@ -368,6 +428,13 @@ def attribute_problems(task: TaskEntry | None, attributes: Mapping[str, Any]) ->
             "must be 64 hexadecimal digits",
         ),
         "env_kwargs": (lambda x: not env_kwargs_problem(task, x), ""),
+        "source": (lambda x: x == TELEOP, f"must be {TELEOP}"),
+        "loop_rate": (lambda x: math.isnan(x) or 0.0 < x < math.inf, "must be positive"),
+        "missed_deadlines": (lambda x: x >= 0, "must be 0 or more"),
+        "policy": (
+            lambda x: isinstance(x, dict) and set(x) == {"name", "sha256"},
+            "must be an object with name and sha256",
+        ),
     }
     problems = []
     for name, (is_valid, valid) in rules.items():

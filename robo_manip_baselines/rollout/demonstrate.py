@@ -26,8 +26,12 @@ from robo_manip_baselines.data import (
     remove_partial_episodes,
     write_episode,
 )
-from robo_manip_baselines.data.files import FAILED_FOLDER, list_failures, seed_of
-from robo_manip_baselines.data.schema import SCHEMA_VERSION
+from robo_manip_baselines.data.files import (
+    FAILED_FOLDER,
+    UNRENDERED_FOLDER,
+    list_failures,
+    seed_of,
+)
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.face_rows import episode_row
@@ -57,6 +61,12 @@ SUMMARY = "summary.json"
 POLL = 0.2
 """s between looks at the steps that worker processes have taken."""
 
+EXPERT_VERSION = 4
+"""Schema version of the episodes of experts."""
+
+SCRIPTED = "scripted"
+"""Source of an episode without the attribute ``source``."""
+
 RECORDING_SOFTWARE = ("mujoco", "numpy", "robo_manip_baselines")
 """Software whose versions episode files hold."""
 
@@ -77,6 +87,88 @@ class Demonstration(NamedTuple):
     attributes: dict[str, Any]
 
 
+class EpisodeRecorder:
+    """Rows, images and attributes of a running episode, whoever acts in it.
+
+    Args:
+        env: made by `make_env`, just reset with ``seed``.
+        seed: of the episode.
+        codec, quality: of `encode_image`, for the cameras of ``env``.
+
+    Raises:
+        ValueError: the environment was not made by its id.
+    """
+
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], seed: int, *, codec: str, quality: int
+    ) -> None:
+        if env.spec is None:
+            raise ValueError("the environment must be made by its id, so that it can be made again")
+        world = world_of(env)
+        self._env, self._world, self._codec, self._quality = env, world, codec, quality
+        self._cameras = world.observation_spec.image_keys()
+        self._rows: dict[str, list[Any]] = defaultdict(list)
+        self._images: dict[str, list[NDArray[np.uint8]]] = {
+            camera: [] for camera in self._cameras.values()
+        }
+        self._start = {**world.start_attributes(), "seed": seed}
+        self._info: dict[str, Any] = {}
+
+    @property
+    def steps(self) -> int:
+        """T, steps so far."""
+        return len(self._rows["action"])
+
+    def before(
+        self, observation: Mapping[str, NDArray[Any]], action: NDArray[Any], **columns: Any
+    ) -> None:
+        """Take in the state before a step, the action, and values of further columns."""
+        for name, value in (*episode_row(self._world).items(), *columns.items()):
+            self._rows[name].append(value)
+        self._rows["action"].append(action)
+        for key, camera in self._cameras.items():
+            self._images[camera].append(encode_image(observation[key], self._codec, self._quality))
+
+    def after(self, info: dict[str, Any]) -> None:
+        """Take in what is known after the step."""
+        for name, value in self._world.touch.row().items():
+            self._rows[name].append(value)
+        self._rows["is_success"].append(info["is_success"])
+        self._rows["is_success_strict"].append(info["is_success_strict"])
+        self._info = info
+
+    def finish(self, expert: str, **attributes: Any) -> Demonstration:
+        """Return the episode, of one step or more.
+
+        Args:
+            expert: name of the expert or operator that acted.
+            **attributes: optional ones of the schema.
+        """
+        env, world, info = self._env, self._world, self._info
+        time, spec = info["completion_time"], env.spec
+        assert spec is not None
+        env_kwargs = dict(spec.kwargs)
+        if env_kwargs.get("motion_library"):
+            env_kwargs["motion_sha256"] = world.library.sha256
+        if "motion" in env_kwargs:
+            env_kwargs["motion"] = str(world.motion)
+        known = {
+            "env_id": spec.id,
+            "env_kwargs": env_kwargs,
+            **self._start,
+            "is_success": info["is_success"],
+            "is_success_strict": info["is_success_strict"],
+            "completion_time": np.nan if time is None else time,
+            "versions": software_versions(*RECORDING_SOFTWARE),
+            "expert": expert,
+            "image_codec": self._codec,
+            "image_quality": self._quality,
+            **attributes,
+        }
+        arrays = {name: np.asarray(values) for name, values in self._rows.items()}
+        return Demonstration(arrays, self._images, known)
+
+
 def demonstrate(
     env: gymnasium.Env[Any, Any],
     expert: str,
@@ -91,53 +183,21 @@ def demonstrate(
     The cameras of ``env``, made by `make_env`, are recorded; ``codec`` and ``quality`` are those of
     `encode_image`. ``on_steps`` is called with 1 after every control step.
     """
-    if env.spec is None:
-        raise ValueError("the environment must be made by its id, so that it can be made again")
     world = world_of(env)
     actor = world.task.make_expert(expert, world)
-    rows: dict[str, list[Any]] = defaultdict(list)
-    cameras = world.observation_spec.image_keys()
-    images: dict[str, list[NDArray[np.uint8]]] = {camera: [] for camera in cameras.values()}
-    observation, info = env.reset(seed=seed)
-    start = world.start_attributes()
+    observation, _ = env.reset(seed=seed)
+    recorder = EpisodeRecorder(env, seed, codec=codec, quality=quality)
     actor.reset()
     ended = False
     while not ended:
         action = actor.act()
-        for name, value in episode_row(world).items():
-            rows[name].append(value)
-        rows["action"].append(action)
-        for key, camera in cameras.items():
-            images[camera].append(encode_image(observation[key], codec, quality))
+        recorder.before(observation, action)
         observation, _, terminated, truncated, info = env.step(action)
-        for name, value in world.touch.row().items():
-            rows[name].append(value)
-        rows["is_success"].append(info["is_success"])
-        rows["is_success_strict"].append(info["is_success_strict"])
+        recorder.after(info)
         ended = terminated or truncated
         if on_steps:
             on_steps(1)
-    time = info["completion_time"]
-    env_kwargs = dict(env.spec.kwargs)
-    if env_kwargs.get("motion_library"):
-        env_kwargs["motion_sha256"] = world.library.sha256
-    if "motion" in env_kwargs:
-        env_kwargs["motion"] = str(world.motion)
-    attributes = {
-        "env_id": env.spec.id,
-        "env_kwargs": env_kwargs,
-        **start,
-        "is_success": info["is_success"],
-        "is_success_strict": info["is_success_strict"],
-        "completion_time": np.nan if time is None else time,
-        "versions": software_versions(*RECORDING_SOFTWARE),
-        "seed": seed,
-        "expert": expert,
-        "image_codec": codec,
-        "image_quality": quality,
-    }
-    arrays = {name: np.asarray(values) for name, values in rows.items()}
-    return Demonstration(arrays, images, attributes)
+    return recorder.finish(expert)
 
 
 @dataclass(frozen=True)
@@ -367,7 +427,7 @@ def _holds_an_episode(folder: Path) -> bool:
 _DEMONSTRATIONS = FolderKind(
     "demonstrations",
     _holds_an_episode,
-    begun=lambda path: path.name == FAILED_FOLDER and path.is_dir(),
+    begun=lambda path: path.name in (FAILED_FOLDER, UNRENDERED_FOLDER) and path.is_dir(),
 )
 
 
@@ -408,19 +468,36 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
     """
     wanted = {
         "env_id": task_entry(collection.env).env_id,
-        "env_kwargs": without_library_path(collection.env_kwargs),
+        "env_kwargs": collection.env_kwargs,
+        "source": SCRIPTED,
         "expert": collection.expert,
         "image_codec": collection.codec,
         "image_quality": collection.quality,
         "xml_hash": xml_hash,
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": EXPERT_VERSION,
+    }
+    refuse_other_settings(collection.out, wanted)
+
+
+def refuse_other_settings(folder: Path, wanted: Mapping[str, Any]) -> None:
+    """Refuse to mix episodes with those of other settings, or other software, in a folder.
+
+    Args:
+        folder: of episodes; may be absent.
+        wanted: attribute -> value that the episodes must have.
+
+    Raises:
+        RequestError: naming the first setting that differs.
+    """
+    wanted = {
+        **wanted,
+        "env_kwargs": without_library_path(wanted["env_kwargs"]),
         "versions": _deciding_versions(software_versions(*RECORDING_SOFTWARE)),
     }
-    for seed in sorted(finished_seeds(collection.out)):
-        if (path := collection.path(seed)) is None:
-            continue
+    for path in [*(list_episodes(folder) if folder.is_dir() else []), *list_failures(folder)]:
         recorded = read_metadata(path)
         there = {
+            "source": SCRIPTED,
             **recorded,
             "env_kwargs": without_library_path(recorded["env_kwargs"]),
             "versions": _deciding_versions(recorded["versions"]),
@@ -428,7 +505,7 @@ def _refuse_other_settings(collection: Collection, xml_hash: str) -> None:
         for name, value in wanted.items():
             if there[name] != value:
                 raise RequestError(
-                    f"'{collection.out}' holds episodes with {name} {there[name]}, not {value} "
+                    f"'{folder}' holds episodes with {name} {there[name]}, not {value} "
                     f"({path.name}); give another --out or remove that folder"
                 )
 

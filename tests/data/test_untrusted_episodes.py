@@ -45,7 +45,8 @@ def seal(path: Path) -> None:
         names = SCHEMA.fields_of(int(file.attrs["schema_version"]))
         arrays = {name: file[name][()] for name in names}
         checksums = {name: group["checksum"][()] for name, group in file["images"].items()}
-        attributes = {i.name: loaded_attribute(i, file.attrs[i.name]) for i in SCHEMA.attributes}
+        known = SCHEMA.attributes_of(int(file.attrs["schema_version"]), file.attrs)
+        attributes = {i.name: loaded_attribute(i, file.attrs[i.name]) for i in known}
         digest = content_digest(SCHEMA, arrays, checksums, attributes)
         file.attrs["content_sha256"] = stored_text(digest)
 

@@ -40,7 +40,8 @@ def seal(file: h5py.File) -> None:
     """Make the digest right again, so that only the damage itself can be found."""
     arrays = {name: file[name][()] for name in SCHEMA.fields_of(int(file.attrs["schema_version"]))}
     checksums = {name: group["checksum"][()] for name, group in file["images"].items()}
-    attributes = {i.name: loaded_attribute(i, file.attrs[i.name]) for i in SCHEMA.attributes}
+    known = SCHEMA.attributes_of(int(file.attrs["schema_version"]), file.attrs)
+    attributes = {i.name: loaded_attribute(i, file.attrs[i.name]) for i in known}
     file.attrs["content_sha256"] = content_digest(SCHEMA, arrays, checksums, attributes)
 
 

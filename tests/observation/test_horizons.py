@@ -48,7 +48,8 @@ def as_version_2(path: Path, out: Path) -> Path:
         arrays = {name: array for name, array in episode.arrays.items() if name not in later}
         arrays["mouth_position"] = episode.array("mouth_position")[:, :6]
         arrays["predicted_mouth"] = episode.array("predicted_mouth")[:, :5]
-        given = [item.name for item in episode.schema.attributes if not item.is_derived]
+        items = [item for item in episode.schema.attributes if not item.is_derived]
+        given = [item.name for item in items if not item.is_optional]
         attributes = {name: episode.attributes[name] for name in given}
     return write_episode(out / path.name, arrays, {}, attributes)
 

@@ -70,6 +70,8 @@ class Attribute:
         description: for the documentation.
         is_derived: filled in by the writer.
         length: of a vector.
+        since: schema version; no attribute of files of a lower one.
+        is_optional: whether an episode may come without.
     """
 
     name: str
@@ -77,6 +79,8 @@ class Attribute:
     description: str
     is_derived: bool = False
     length: int = 0
+    since: int = 1
+    is_optional: bool = False
 
 
 @dataclass(frozen=True)
@@ -399,6 +403,8 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "render_size": (list, type(None)),
     "object_pose": (bool,),
     "relative": (bool,),
+    "mouth_frame": (str,),
+    "mouth_time": (str,),
     "arms": (str,),
     "corruption": (dict, type(None)),
     "face": (str,),

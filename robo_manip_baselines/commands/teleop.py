@@ -1,0 +1,155 @@
+"""``bin/Teleop.py``: a person steers the arms, and demonstrations are recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from annotated_types import Interval
+
+from robo_manip_baselines.commands.rollout import face_arguments
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
+from robo_manip_baselines.observation import CAMERAS, ObservationSpec
+from robo_manip_baselines.observation.spec import ImageSize
+from robo_manip_baselines.runs.command import parse
+from robo_manip_baselines.runs.errors import RequestError, require_printable
+from robo_manip_baselines.runs.progress import closing_table
+from robo_manip_baselines.runs.ranges import Episodes, Quality, Seed
+
+if TYPE_CHECKING:
+    from robo_manip_baselines.teleop.teleoperate import TeleopConfig
+
+EXAMPLE = """python bin/Teleop.py FeedingEnv --num_episodes 10 --out dataset/teleop
+
+Example: python bin/Teleop.py FeedingEnv --device replay --episodes dataset/FeedingEnv"""
+
+DESCRIPTION = "Steer the arms by hand, and record demonstrations."
+
+DEFAULT_DEVICE = "replay"
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """Images of the episodes.
+
+    Attributes:
+        cameras: Cameras to record, or none.
+        image_size: Height and width of the images.
+        image_codec: jpeg, png or raw.
+        image_quality: Quality of jpeg, 1 to 100.
+    """
+
+    cameras: tuple[str, ...] = CAMERAS
+    image_size: ImageSize = (480, 640)
+    image_codec: str = "jpeg"
+    image_quality: Quality = 90
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Only with --device replay.
+
+    Attributes:
+        episodes: Episode files, or folders of them, whose end-effector motion is played back.
+    """
+
+    episodes: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class TeleopOptions:
+    """Options of the command.
+
+    Attributes:
+        env: Task, for example FeedingEnv.
+        device: Device of the person: replay, which plays recorded episodes back as a person would.
+        arm: Arms that the person steers: right, left or both; if not given, those of the task.
+        out: Folder of the episodes; if not given, dataset/teleop/<env>.
+        num_episodes: Episodes, one for each seed from --seed on that has none yet.
+        seed: Seed of the first episode.
+        operator: Name in the episodes of the person who steers.
+        time_limit: s after which an episode ends; if not given, that of the task.
+        face: Kind of face: visual, or physical, soft tissue on a head that yields.
+        face_motion: Start of the face's motion: with the episode, or after_lift.
+        motion: Motion of the face: recorded, sway, ..., with parameters sway:amplitude=0.03, or a
+            sum recorded+tremor.
+        people: People who move: all, train or test.
+        clips: Recorded clips to draw from; all if not given.
+        motion_library: File of recorded face motion, or extended, which ships, too.
+        images: Images of the episodes.
+        replay: Only with --device replay.
+    """
+
+    env: tyro.conf.Positional[str]
+    device: str = DEFAULT_DEVICE
+    arm: str | None = None
+    out: Path | None = None
+    num_episodes: Episodes = 50
+    seed: Seed = 0
+    operator: str = "operator"
+    time_limit: Annotated[float | None, Interval(ge=0.02, le=3600.0)] = None
+    face: str | None = None
+    face_motion: str | None = None
+    motion: str | None = None
+    people: str | None = None
+    clips: tuple[str, ...] = ()
+    motion_library: Path | None = None
+    images: tyro.conf.OmitArgPrefixes[ImageOptions] = field(default_factory=ImageOptions)
+    replay: tyro.conf.OmitArgPrefixes[ReplayOptions] = field(default_factory=ReplayOptions)
+
+    def __post_init__(self) -> None:
+        require_printable("--operator", self.operator)
+
+
+def to_config(options: TeleopOptions) -> TeleopConfig:
+    """Return the configuration that the options ask for.
+
+    Raises:
+        RequestError: a value is not valid.
+    """
+    from robo_manip_baselines.teleop.teleoperate import TeleopConfig
+
+    task, images = task_entry(options.env), options.images
+    if options.replay.episodes and options.device != "replay":
+        raise RequestError("--episodes goes with --device replay; leave it out")
+    spec = ObservationSpec(cameras=images.cameras, image_size=images.image_size)
+    limit = options.time_limit
+    return TeleopConfig(
+        env=options.env,
+        out=options.out or Path("dataset") / "teleop" / options.env,
+        device=options.device,
+        arm=options.arm or task.arms[0],
+        first_seed=options.seed,
+        num_episodes=options.num_episodes,
+        operator=options.operator,
+        step_limit=None if limit is None else round(limit / CONTROL_PERIOD),
+        cameras=spec.cameras,
+        image_size=spec.image_size,
+        codec=images.image_codec,
+        quality=images.image_quality,
+        env_kwargs=face_arguments(options),
+        episodes=options.replay.episodes,
+    )
+
+
+def main(args: Sequence[str]) -> None:
+    """Run ``bin/Teleop.py``."""
+    default = TeleopOptions(tyro.MISSING)
+    options = parse(TeleopOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)
+    config = to_config(options)
+    from robo_manip_baselines.teleop.teleoperate import teleoperate
+
+    summary = teleoperate(config)
+    late = f"{summary.missed} of {summary.steps} steps"
+    rows = {
+        "saved": f"{summary.saved}, {summary.successes} of them successes",
+        "discarded": str(summary.discarded),
+        "loop rate": "-" if math.isnan(summary.rate) else f"{summary.rate:.1f} Hz, late {late}",
+        "written to": str(config.out),
+    }
+    print(closing_table(rows))  # noqa: T201

@@ -1,0 +1,224 @@
+"""A session from its configuration: environment, device, folder, loop."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import Interval
+
+from robo_manip_baselines.data import EpisodeReader, list_episodes
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.face.motion import pin_library
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import (
+    TaskEntry,
+    make_env,
+    task_entry,
+    without_library_path,
+)
+from robo_manip_baselines.observation import CAMERAS
+from robo_manip_baselines.observation.spec import ARMS
+from robo_manip_baselines.rollout.demonstrate import (
+    refuse_other_settings,
+    require_demonstrations_folder,
+)
+from robo_manip_baselines.runs.documents import as_json
+from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.files import locked
+from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY
+from robo_manip_baselines.runs.ranges import Episodes, Quality, Seed, require_ranges
+from robo_manip_baselines.teleop.device import DEVICES, TeleopDevice, make_device
+from robo_manip_baselines.teleop.recording import EpisodeStore, free_seeds
+from robo_manip_baselines.teleop.replay import ReplayDevice
+from robo_manip_baselines.teleop.session import SessionSummary, TeleopSession
+
+STEERED: Mapping[str, tuple[str, ...]] = {
+    "right": ("right",),
+    "left": ("left",),
+    "both": ("left", "right"),
+}
+"""Value of ``arm`` -> arms that the person steers."""
+
+
+@dataclass(frozen=True)
+class TeleopConfig:
+    """Configuration of a session.
+
+    Attributes:
+        env: name of the task.
+        out: folder of the episodes; failed ones go to its ``failed/``.
+        device: name of the device.
+        arm: key of `STEERED`.
+        first_seed: of the episodes, and ``num_episodes``: one for each seed from it on.
+        operator: name of the person in the files.
+        step_limit: control steps after which an episode ends; that of the task if None.
+        cameras, image_size, codec, quality: of the recorded images.
+        env_kwargs: further arguments of the environment.
+        episodes: files, or folders of them, for the device ``replay``.
+
+    Raises:
+        RequestError: a value is not valid.
+    """
+
+    env: str
+    out: Path
+    device: str
+    arm: str
+    first_seed: Seed = 0
+    num_episodes: Episodes = 50
+    operator: str = "operator"
+    step_limit: Annotated[int | None, Interval(ge=1, le=180_000)] = None
+    cameras: tuple[str, ...] = CAMERAS
+    image_size: tuple[int, int] = (480, 640)
+    codec: str = "jpeg"
+    quality: Quality = DEFAULT_QUALITY
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    episodes: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_choice("device", self.device, DEVICES)
+        require_choice("arm", self.arm, STEERED)
+        require_choice("image codec", self.codec, CODECS)
+        require_ranges(self)
+
+    @property
+    def task(self) -> TaskEntry:
+        """Entry of the task."""
+        return task_entry(self.env)
+
+    @property
+    def steered(self) -> tuple[str, ...]:
+        """Arms that the person steers."""
+        return STEERED[self.arm]
+
+    def recorded_kwargs(self) -> dict[str, Any]:
+        """Return the arguments of the environment as files have them, cameras included."""
+        kwargs: dict[str, Any] = {"cameras": self.cameras, "image_size": self.image_size}
+        arms = self.task.arms[0]
+        if not set(self.steered) <= set(ARMS[arms]):
+            arms = "both"
+            kwargs["arms"] = arms
+        self.task.require_arms(arms)
+        return pin_library(as_json({**kwargs, "face_motion": "episode", **self.env_kwargs}))
+
+
+def teleoperate(config: TeleopConfig) -> SessionSummary:
+    """Run a session until the person ends it, or all episodes are there.
+
+    Killed at any moment, it loses the running episode; the same call carries on from there.
+
+    Raises:
+        RequestError: the request cannot be met; nothing has been written then.
+    """
+    kwargs = config.recorded_kwargs()
+    if config.cameras and (problem := opengl_problem()):
+        raise RequestError(f"--cameras {' '.join(config.cameras)}: {problem}; or --cameras none")
+    require_demonstrations_folder(config.out)
+    live = {**kwargs, "cameras": (), "disable_env_checker": True}
+    with contextlib.closing(make_env(config.env, **live)) as env:
+        world = world_of(env)
+        wanted = {
+            "env_id": config.task.env_id,
+            "env_kwargs": kwargs,
+            "source": "teleop",
+            "image_codec": config.codec,
+            "image_quality": config.quality,
+            "xml_hash": world.xml_hash,
+        }
+        refuse_other_settings(config.out, wanted)
+        refuse_other_settings(config.out / "unrendered", wanted)
+        device = open_device(config, kwargs)
+        with (
+            contextlib.closing(device),
+            locked(config.out, is_kept=False),
+            contextlib.closing(EpisodeStore(config.out)) as store,
+        ):
+            session = TeleopSession(
+                env,
+                device,
+                store,
+                _seeds(config, device, store),
+                config.steered,
+                env_kwargs=kwargs,
+                operator=config.operator,
+                device_name=config.device,
+                step_limit=config.step_limit or config.task.max_episode_steps,
+                codec=config.codec,
+                quality=config.quality,
+            )
+            summary = session.run()
+            store.finish()
+    return summary
+
+
+def open_device(config: TeleopConfig, kwargs: Mapping[str, Any]) -> TeleopDevice:
+    """Open the device of a session.
+
+    Args:
+        config: of the session.
+        kwargs: arguments of the environment, as files have them.
+
+    Raises:
+        RequestError: it cannot be opened, or does not go with the rest; says what to do.
+    """
+    if config.device == "replay":
+        paths = _episode_paths(config)
+        for path in paths:
+            _require_same_world(path, config, kwargs)
+        return make_device("replay", episodes=paths, arms=config.steered)
+    return make_device(config.device, arms=config.steered)
+
+
+def _episode_paths(config: TeleopConfig) -> list[Path]:
+    paths: list[Path] = []
+    for given in config.episodes:
+        paths += list_episodes(given) if given.is_dir() else [given]
+    if any(path.parent.resolve() == config.out.resolve() for path in paths):
+        raise RequestError(f"--out {config.out}: is played back; name another folder")
+    return paths[: config.num_episodes]
+
+
+_DRAWING = ("cameras", "image_size", "render_size", "shadows", "multisamples", "obs", "horizon")
+"""Arguments of the environment that say nothing of how the world goes on."""
+
+
+def _require_same_world(path: Path, config: TeleopConfig, kwargs: Mapping[str, Any]) -> None:
+    """Require that an episode was recorded in the world of the session.
+
+    Raises:
+        RequestError: it was not.
+    """
+    with EpisodeReader(path) as episode:
+        known = episode.attributes
+    worlds = [
+        {k: v for k, v in without_library_path(item).items() if k not in _DRAWING}
+        for item in ({"face_motion": "episode", **known["env_kwargs"]}, kwargs)
+    ]
+    if known["env_id"] != config.task.env_id:
+        raise RequestError(f"'{path}' is of {known['env_id']}, not of {config.env}")
+    for name in sorted({*worlds[0], *worlds[1]} - {"arms"}):
+        recorded, ours = (json.dumps(world.get(name)) for world in worlds)
+        if recorded != ours:
+            raise RequestError(
+                f"'{path}' was recorded with {name} {recorded}, not {ours}; give the options that "
+                "it was recorded with"
+            )
+
+
+def _seeds(config: TeleopConfig, device: TeleopDevice, store: EpisodeStore) -> list[int]:
+    """Return the seeds that are still to be recorded.
+
+    Raises:
+        RequestError: there is none.
+    """
+    if isinstance(device, ReplayDevice):
+        seeds = [seed for seed in device.seeds if seed not in store.seeds]
+        if not seeds and not store.waiting:
+            raise RequestError(f"'{config.out}' holds an episode of every seed played back")
+        return seeds
+    return list(free_seeds(config.out, config.first_seed, config.num_episodes, store.seeds))
