@@ -288,3 +288,11 @@ def test_episodes_say_with_what_they_were_recorded(tmp_path: Path) -> None:
     assert json.loads((out / "summary.json").read_text())["successes"] == 1
     with EpisodeReader(list_episodes(out)[0]) as episode:
         assert episode.attributes["env_kwargs"]["utensil"] == "spoon"
+
+
+def test_a_policy_feeds_with_what_it_was_trained_with(tmp_path: Path) -> None:
+    options = "FeedingEnv --policy Act --checkpoint shipped:baseline --obs baseline --cameras none"
+    more = ["--object_pose", "--num_episodes", "1", "--out", str(tmp_path / "out")]
+    message = "was trained with utensil gripper, not spoon"
+    with pytest.raises(RequestError, match=message):
+        rollout.main([*options.split(), *more, "--utensil", "spoon"])
