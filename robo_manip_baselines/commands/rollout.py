@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import tyro
 from annotated_types import Interval
 
-from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, require_viewer
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
@@ -124,6 +124,7 @@ class RolloutOptions:
         motion_library: File of recorded face motion, or extended, which ships, too, and has more
             people. If not given, the one that ships, or that of the demonstrations.
         workers: Processes in which environments step; with --policy, 0 steps them in the main one.
+        view: Show the episodes in MuJoCo's viewer, one after another, in real time.
         spec: Observation. With --scripted, cameras and image_size are recorded; with --policy, the
             observation is that of the checkpoint, and options are checked against it.
         corruption: --no_corruption shows the truth, whatever the checkpoint and other options say.
@@ -145,6 +146,7 @@ class RolloutOptions:
     utensil: str | None = None
     motion_library: Path | None = None
     workers: Processes = 2
+    view: bool = False
     spec: tyro.conf.OmitArgPrefixes[ObservationSpec] = field(default_factory=lambda: UNTRAINED)
     corruption: bool = True
     demonstration: tyro.conf.OmitArgPrefixes[ScriptedOptions] = field(
@@ -229,6 +231,8 @@ def require_consistent(options: RolloutOptions) -> None:
     if changed:
         wanted = "--policy" if options.scripted else "--scripted"
         raise RequestError(f"--{changed[0]} goes with {wanted}; leave it out")
+    if options.view:
+        require_viewer()
 
 
 def _changed_options(given: Any, default: Any) -> list[str]:
@@ -268,6 +272,7 @@ def to_collection(options: RolloutOptions) -> Collection:
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
+        is_watched=options.view,
     )
 
 
@@ -361,6 +366,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         device=given.device,
         precision=given.precision,
         videos=given.video,
+        is_watched=options.view,
     )
 
 

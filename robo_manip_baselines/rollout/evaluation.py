@@ -89,6 +89,7 @@ class EvaluationConfig:
         device: of the network: auto, cpu, cuda or cuda:NUMBER.
         precision: of the network: fp32, or bf16 for the products inside it.
         videos: number of videos, half of them of successes.
+        is_watched: show the episodes in MuJoCo's viewer, one after another, in real time.
 
     Raises:
         RequestError: a value is not valid.
@@ -108,6 +109,7 @@ class EvaluationConfig:
     device: str = "auto"
     precision: str = "fp32"
     videos: NonNegativeInt = 0
+    is_watched: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "env_kwargs", as_json(self.env_kwargs))
@@ -125,13 +127,15 @@ class EvaluationConfig:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Return what JSON can hold."""
-        return {
+        """Return what JSON can hold, without ``is_watched``, on which no result depends."""
+        values = {
             **asdict(self),
             "checkpoint": str(self.checkpoint),
             "seeds": [self.seeds.start, self.seeds.stop],
             "out": None if self.out is None else str(self.out),
         }
+        del values["is_watched"]
+        return values
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> EvaluationConfig:
@@ -332,9 +336,13 @@ class EvaluationPlan:
             return
         checkpoint, successes = self.checkpoint, 0
         num_envs, longest = min(self.config.num_envs, len(seeds)), self.env.task.max_episode_steps
+        workers, env = self.config.workers, self.env
+        if self.config.is_watched:  # results do not depend on the mode, and do not record it
+            num_envs, workers = 1, 0
+            env = replace(env, env_kwargs={**env.env_kwargs, "render_mode": "human"})
         with (
             self._one_thread_if_small(),
-            open_envs(self.env, num_envs, self.config.workers) as envs,
+            open_envs(env, num_envs, workers) as envs,
             EpisodeProgress(len(seeds), longest, checkpoint.policy) as progress,
         ):
 

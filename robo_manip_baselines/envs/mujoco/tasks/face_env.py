@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -194,6 +195,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )
         self._viewer: Any = None
+        self._shown_at = 0.0
         self._stage = "made"
         low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high)
@@ -325,14 +327,19 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded(f"{method}() before reset(): call reset() first")
 
     def _show(self) -> None:
-        """Show the present state in MuJoCo's viewer, in mode ``human``."""
+        """Show the present state in MuJoCo's viewer, in mode ``human``, no faster than in life."""
         if self.render_mode != "human":
             return
         if self._viewer is None:
             from mujoco import viewer  # opens a display's libraries
 
             self._viewer = viewer.launch_passive(self.model, self.data)
+        if not self._viewer.is_running():  # the person has closed its window
+            return
         self._viewer.sync()
+        # From one frame to the next, so that a slow step is not followed by hasty ones.
+        time.sleep(max(0.0, self._shown_at + CONTROL_PERIOD - time.monotonic()))
+        self._shown_at = time.monotonic()
 
     # -- observation ----------------------------------------------------------------------------
 
