@@ -328,7 +328,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
     from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 
     policy_entry(options.policy or "")
-    task_entry(options.env)
+    task_entry(options.env).require_env()
     given = options.evaluation
     if given.checkpoint is None or checkpoint is None:
         raise RequestError(
@@ -402,6 +402,7 @@ def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | Non
     default = RolloutOptions(tyro.MISSING, spec=spec)
     options = parse(RolloutOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)
     require_consistent(options)
+    task_entry(options.env).require_env()
     if options.scripted and not last_value(args, "arms"):
         arms = task_entry(options.env).arms[0]
         options = replace(options, spec=replace(options.spec, arms=arms))
