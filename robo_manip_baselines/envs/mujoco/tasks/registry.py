@@ -227,6 +227,7 @@ class TaskEntry:
         metrics: ``module:class`` of its `EpisodeMetrics`.
         failures: kind of failure -> description.
         arms: that can do it, of `ObservationSpec.arms`; the first is the default.
+        choices: arguments of its own environment -> valid values; the first is the default.
         names: of target and objects in observations.
         target_field, predicted_field: fields of an episode that hold the true target and a
             predictor's output for it; ``predicted_field`` is empty where the target is not the
@@ -253,6 +254,7 @@ class TaskEntry:
     failures: Mapping[str, str]
     version: int = 0
     arms: tuple[str, ...] = tuple(ARMS)
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     names: ObservedNames = field(default_factory=ObservedNames)
     target_field: str = "mouth_position"
     predicted_field: str = "predicted_mouth"
@@ -305,6 +307,16 @@ class TaskEntry:
             raise RequestError(
                 f"arms {arms}: cannot do {self.name}; valid: {', '.join(sorted(self.arms))}"
             )
+
+    def require_argument(self, name: str, value: str) -> str:
+        """Return the value of an argument of the task's own environment.
+
+        Raises:
+            RequestError: the task has no such argument, or not that value.
+        """
+        if name not in self.choices:
+            raise RequestError(f"{name} {value}: {self.name} has no such choice; leave it out")
+        return require_choice(name, value, self.choices[name])
 
     def make_expert(self, name: str, env: Any) -> Expert:
         """Make a scripted expert for an unwrapped environment.
