@@ -51,7 +51,7 @@ envs = gymnasium.make_vec(
     vectorization_mode="async",
     wrappers=[
         ApproachReward,
-        lambda env: gymnasium.wrappers.RescaleAction(env, -1.0, 1.0),
+        lambda env: gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1)),
         gymnasium.wrappers.FlattenObservation,
     ],
     vector_kwargs={"context": "fork"},  # this file has no __main__ guard
