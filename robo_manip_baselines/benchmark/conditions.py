@@ -313,6 +313,7 @@ def read_conditions(path: Path) -> ConditionFile:
     conditions: list[ConditionConfig] = []
     try:
         task = task_entry(document.env)
+        task.require_env()
         for number, values in enumerate(document.conditions):
             place = f", line {lines[key, number]}"
             condition = ConditionConfig.from_yaml(values).for_task(task)

@@ -119,6 +119,8 @@ class RolloutOptions:
         people: People who move: all, or train or test for demonstrations and evaluation with
             different people. If not given, all, and test for a policy that learnt from train.
         clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
+        utensil: What brings the food in FeedingEnv: gripper or spoon. If not given, gripper, or as
+            in the demonstrations of the policy.
         motion_library: File of recorded face motion, or extended, which ships, too, and has more
             people. If not given, the one that ships, or that of the demonstrations.
         workers: Processes in which environments step; with --policy, 0 steps them in the main one.
@@ -141,6 +143,7 @@ class RolloutOptions:
     motion: str | None = None
     people: str | None = None
     clips: tuple[str, ...] = ()
+    utensil: str | None = None
     motion_library: Path | None = None
     workers: Processes = 2
     view: bool = False
@@ -157,9 +160,16 @@ class RolloutOptions:
         return range(start, start + self.num_episodes)
 
     @property
-    def face_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about the face and its motion that were given."""
-        return face_arguments(self)
+    def env_arguments(self) -> dict[str, Any]:
+        """Arguments of the environment that were given: of the face, and of the task alone.
+
+        Raises:
+            RequestError: one is not valid, or the task has no such argument.
+        """
+        given = face_arguments(self)
+        if self.utensil is not None:
+            given["utensil"] = task_entry(self.env).require_argument("utensil", self.utensil)
+        return given
 
 
 class FaceOptions(Protocol):
@@ -258,7 +268,7 @@ def to_collection(options: RolloutOptions) -> Collection:
         out=options.out or Path("dataset") / options.env,
         expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
         seeds=options.seeds(first=0),
-        env_kwargs={**env_kwargs, "face_motion": "episode", **options.face_arguments},
+        env_kwargs={**env_kwargs, "face_motion": "episode", **options.env_arguments},
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
@@ -318,7 +328,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
     from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 
     policy_entry(options.policy or "")
-    task_entry(options.env)
+    task_entry(options.env).require_env()
     given = options.evaluation
     if given.checkpoint is None or checkpoint is None:
         raise RequestError(
@@ -345,7 +355,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         checkpoint=given.checkpoint,
         seeds=options.seeds(FIRST_SEED),
         out=options.out,
-        env_kwargs=options.face_arguments,
+        env_kwargs=options.env_arguments,
         corruption=None if corruption == trained.corruption else corruption,
         temporal_ensemble=given.temporal_ensemble,
         n_action_steps=given.n_action_steps,
@@ -392,6 +402,7 @@ def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | Non
     default = RolloutOptions(tyro.MISSING, spec=spec)
     options = parse(RolloutOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)
     require_consistent(options)
+    task_entry(options.env).require_env()
     if options.scripted and not last_value(args, "arms"):
         arms = task_entry(options.env).arms[0]
         options = replace(options, spec=replace(options.spec, arms=arms))

@@ -365,9 +365,14 @@ class ObservationSpec:
         self, vector: NDArray[np.float32], names: ObservedNames
     ) -> dict[str, NDArray[np.float32]]:
         """Return the vectors (..., n) of an observation as views of the packed one (..., S)."""
+        return {name: vector[..., part] for name, part in self.slices(names).items()}
+
+    def slices(self, names: ObservedNames) -> dict[str, slice]:
+        """Return where the vectors of an observation are in the packed one."""
         components = self.components(names)
-        ends = np.cumsum([len(part) for part in components.values()])
-        return dict(zip(components, np.split(vector, ends[:-1], axis=-1), strict=True))
+        ends = np.cumsum([len(part) for part in components.values()]).tolist()
+        starts = (0, *ends[:-1])
+        return {name: slice(*span) for name, *span in zip(components, starts, ends, strict=True)}
 
     def target_positions(self, vector: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the target positions, (..., F, 3) m, in packed vectors (..., S).

@@ -20,7 +20,7 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, pin_library
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
-from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry, without_library_path
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.checkpoint import (
     SHIPPED_PREFIX,
@@ -482,7 +482,15 @@ def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> str:
     Raises:
         RequestError: naming what the checkpoint has and what the environment has.
     """
-    face = checkpoint.dataset.get("env_kwargs", {}).get("face", "visual")
+    trained_kwargs = checkpoint.dataset.get("env_kwargs", {})
+    for name, (usual, *_) in task_entry(config.env).choices.items():
+        trained, asked = (own.get(name, usual) for own in (trained_kwargs, config.env_kwargs))
+        if trained != asked:
+            raise RequestError(
+                f"checkpoint '{checkpoint.folder}' was trained with {name} {trained}, not {asked}; "
+                "leave the option as trained, or train another policy"
+            )
+    face = trained_kwargs.get("face", "visual")
     own = here = _facts_of_model(config)
     if here["face"] != face:
         own = _facts_of_model(config, face=face)

@@ -190,7 +190,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             )
         for clip in self.clips or ():
             require_choice("clip", clip, set(self.library.part(self.people).run_clip))
-        super().__init__(face, spec.arm_names, self.task.names.objects)
+        super().__init__(face, spec.arm_names, (*self.task.names.objects, *self.tools))
         self.renderer = CameraRenderer(
             self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )
@@ -200,6 +200,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high)
         self.observation_space = make_observation_space(spec, self.task.names)
+        self._slices = spec.slices(self.task.names)
 
     # -- task -----------------------------------------------------------------------------------
 
@@ -366,7 +367,9 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         """
         spec, state = self.observation_spec, self.state()
         self.vector = spec.pack(state, self._pipeline.observe(state) if self._pipeline else None)
-        observation: dict[str, NDArray[Any]] = {**spec.split(self.vector, self.task.names)}
+        observation: dict[str, NDArray[Any]] = {}
+        for name, part in self._slices.items():
+            observation[name] = self.vector[part]
         if spec.cameras and self.renders_images:
             views = self.renderer.render(self.data, spec.cameras)
             for key, camera in spec.image_keys().items():
