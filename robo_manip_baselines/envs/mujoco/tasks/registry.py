@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.observation import Corruption, ObservedNames
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.observation.spec import ARMS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
@@ -227,6 +227,7 @@ class TaskEntry:
         metrics: ``module:class`` of its `EpisodeMetrics`.
         failures: kind of failure -> description.
         arms: that can do it, of `ObservationSpec.arms`; the first is the default.
+        choices: arguments of its own environment -> valid values; the first is the default.
         names: of target and objects in observations.
         target_field, predicted_field: fields of an episode that hold the true target and a
             predictor's output for it; ``predicted_field`` is empty where the target is not the
@@ -253,6 +254,7 @@ class TaskEntry:
     failures: Mapping[str, str]
     version: int = 0
     arms: tuple[str, ...] = tuple(ARMS)
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     names: ObservedNames = field(default_factory=ObservedNames)
     target_field: str = "mouth_position"
     predicted_field: str = "predicted_mouth"
@@ -306,6 +308,16 @@ class TaskEntry:
                 f"arms {arms}: cannot do {self.name}; valid: {', '.join(sorted(self.arms))}"
             )
 
+    def require_argument(self, name: str, value: str) -> str:
+        """Return the value of an argument of the task's own environment.
+
+        Raises:
+            RequestError: the task has no such argument, or not that value.
+        """
+        if name not in self.choices:
+            raise RequestError(f"{name} {value}: {self.name} has no such choice; leave it out")
+        return require_choice(name, value, self.choices[name])
+
     def make_expert(self, name: str, env: Any) -> Expert:
         """Make a scripted expert for an unwrapped environment.
 
@@ -318,13 +330,17 @@ class TaskEntry:
         """Make the metrics of one episode."""
         return load_part(self.metrics)()
 
-    def require_forecasts(self, corruption: Corruption) -> None:
+    def require_forecasts(self, spec: ObservationSpec) -> None:
         """Require that the target is the mouth, which is what is forecast, if forecasts are shown.
+
+        A camera shows forecasts, too.
 
         Raises:
             RequestError: it is another point of the face.
         """
+        corruption = spec.corruption
         shown = corruption.prediction != "truth" and f"prediction {corruption.prediction}"
+        shown = shown or (spec.sees_by_camera and f"mouth_source {spec.mouth_source}")
         shown = shown or (corruption.error == "model" and "error model")
         if shown and not self.predicted_field:
             raise RequestError(
@@ -416,6 +432,8 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "mouth_time": (str,),
     "arms": (str,),
     "corruption": (dict, type(None)),
+    "mouth_source": (str,),
+    "camera_latency": (int, str),
     "face": (str,),
     "face_motion": (str,),
     "motion": (str,),

@@ -26,6 +26,7 @@ ENTRY = TaskEntry(
         "anticipatory": f"{_PACKAGE}.expert:anticipatory",
         "servo": f"{_PACKAGE}.expert:servo",
     },
+    choices={"utensil": ("gripper", "spoon")},
     metrics=f"{_PACKAGE}.metrics:FeedingMetrics",
     failures={
         "never_grasped": "the cube was never lifted by 0.10 m",
