@@ -15,8 +15,8 @@ KERNELS = ((8, 4, 2), (4, 2, 1), (3, 1, 1), (3, 2, 1))
 """Size, stride and padding of the convolutions; the first three are those of Mnih et al. 2015."""
 
 MEAN, STD = 115.0, 58.0
-"""Of colours from 0 to 255: ImageNet's, averaged over the three. One number each in place of one for
-each channel saves 25 of 68 ms of a forward pass; the convolutions can do the rest."""
+"""Of colours from 0 to 255: ImageNet's, averaged over the three. One number each in place of one
+for each channel saves 25 of 68 ms of a forward pass; the convolutions can do the rest."""
 
 MIN_SIDE = 8
 """Pixels; smaller images have no cell."""
