@@ -187,6 +187,7 @@ _NOT_OF_A_CONDITION = (
     # Of the preset:
     *("spec", "cameras", "image_size", "render_size", "object_pose", "arms", "corruption"),
     *("error_stats", "stats_sha256"),  # one file for all conditions
+    *("mouth_source", "camera_latency"),  # policies are trained with the truth
 )
 
 

@@ -37,13 +37,17 @@ DESCRIPTION = (
     "(--policy, --checkpoint)."
 )
 
+PERCEPTION = ("mouth_source", "camera_latency")
+"""Parts of the observation that may differ between training and evaluation."""
+
 UNTRAINED = ObservationSpec("current_pred")
 """Defaults of the observation where no checkpoint gives them."""
 
 PREVIEW = "preview.mp4"
 
-RECORDED = ("cameras", "image_size", "arms")
-"""Parts of the observation that demonstrations hold; they hold the truth behind the others."""
+RECORDED = ("cameras", "image_size", "arms", *PERCEPTION)
+"""Parts of the observation that demonstrations hold, or that their expert goes by; they hold the
+truth behind the others."""
 
 logger = logging.getLogger(__name__)
 
@@ -263,6 +267,8 @@ def to_collection(options: RolloutOptions) -> Collection:
     env_kwargs: dict[str, Any] = {"cameras": spec.cameras, "image_size": spec.image_size}
     if spec.arms != task_entry(options.env).arms[0]:
         env_kwargs["arms"] = spec.arms
+    if spec.sees_by_camera:
+        env_kwargs |= {name: getattr(spec, name) for name in PERCEPTION}
     return Collection(
         env=options.env,
         out=options.out or Path("dataset") / options.env,
@@ -338,13 +344,15 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
     typed = {"policy": options.policy, "environment": options.env, **vars(options.spec)}
     values = {"policy": checkpoint.policy, "environment": checkpoint.env, **vars(trained)}
     for name, value in values.items():
-        if name != "corruption" and typed[name] != value:
+        if name not in ("corruption", *PERCEPTION) and typed[name] != value:
             raise RequestError(
                 f"checkpoint '{checkpoint.folder}' was trained with {name} {_as_typed(value)}, not "
                 f"{_as_typed(typed[name])}; leave the option as trained, or train another policy"
             )
     corruption = (options.spec.corruption if options.corruption else Corruption()).pinned()
-    is_given = options.corruption and not corruption.is_same_as(trained.corruption)
+    by_camera = options.spec.sees_by_camera  # in place of the corruption
+    is_given = options.corruption and not by_camera
+    is_given = is_given and not corruption.is_same_as(trained.corruption)
     if is_given and not given.change_corruption:
         raise RequestError(
             f"checkpoint '{checkpoint.folder}' was trained with {trained.corruption}, not with "
@@ -356,7 +364,9 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         seeds=options.seeds(FIRST_SEED),
         out=options.out,
         env_kwargs=options.env_arguments,
-        corruption=None if corruption == trained.corruption else corruption,
+        corruption=None if by_camera or corruption == trained.corruption else corruption,
+        mouth_source=options.spec.mouth_source,
+        camera_latency=options.spec.camera_latency,
         temporal_ensemble=given.temporal_ensemble,
         n_action_steps=given.n_action_steps,
         strategy=given.strategy,
@@ -398,6 +408,8 @@ def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | Non
             corruption = replace(corruption, error_stats=None, stats_sha256=None)
         elif last_value(args, "error_stats"):
             corruption = replace(corruption, stats_sha256=None)
+        if last_value(args, "mouth_source") not in (None, "truth"):
+            corruption = Corruption()  # a camera has errors of its own
         spec = replace(checkpoint.spec, corruption=corruption)
     default = RolloutOptions(tyro.MISSING, spec=spec)
     options = parse(RolloutOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)

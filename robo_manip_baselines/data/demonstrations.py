@@ -200,6 +200,12 @@ def load_demonstrations(
         EpisodeFileError: a file is damaged, was changed after it was recorded, or is in use.
     """
     folder = Path(folder)
+    if spec.sees_by_camera:
+        raise RequestError(
+            f"mouth_source {spec.mouth_source}: demonstrations hold the true mouth; train with "
+            "truth, with an error if wanted, and evaluate by camera: bin/Rollout.py --policy ... "
+            f"--mouth_source {spec.mouth_source}"
+        )
     # With the digest of the statistics, so that a policy is evaluated with those it learnt from.
     spec = replace(spec, corruption=spec.corruption.pinned())
     pipeline = spec.make_pipeline()
@@ -314,7 +320,7 @@ def _forecaster(
     from robo_manip_baselines.envs.mujoco.face.forecasters import MotionForecasters
 
     with EpisodeReader(path) as episode:
-        episode.task.require_forecasts(spec.corruption)
+        episode.task.require_forecasts(spec)
         made = MotionForecasters.of_kwargs(episode.attributes["env_kwargs"])
     return lambda track, seed: made.forecast_track(name, track, seed)
 

@@ -457,6 +457,12 @@ def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]
     world = world_of(env)
     env.reset(seed=collection.seeds.start)
     actor = world.task.make_expert(collection.expert, world)
+    if world.camera_mouth and not getattr(actor, "goes_by_observation", False):
+        raise RequestError(
+            f"mouth_source {world.observation_spec.mouth_source}: the expert "
+            f"'{collection.expert}' of {collection.env} knows the true mouth; leave it out, or "
+            "choose an expert that goes by what is observed: servo of FeedingEnv or DrinkingEnv"
+        )
     actor.reset()
     action = actor.act()
     if action.shape != env.action_space.shape:
@@ -550,7 +556,8 @@ def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any
     recorded = episode.attributes
     task = entry_of_id(recorded["env_id"])
     kwargs = {**recorded["env_kwargs"], **changes}
-    kwargs.pop("error", None)  # of older releases; it says what was shown
+    for name in ("error", "mouth_source", "camera_latency"):  # ``error`` is of older releases
+        kwargs.pop(name, None)  # they say what was shown to whom the recorded actions are
     env = make_env(task.name, **kwargs)
     xml_hash = world_of(env).xml_hash
     if xml_hash != recorded["xml_hash"]:

@@ -21,7 +21,8 @@ from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, pin_libr
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry, without_library_path
-from robo_manip_baselines.observation import Corruption
+from robo_manip_baselines.observation import Corruption, ObservationSpec
+from robo_manip_baselines.observation.spec import CameraLatency
 from robo_manip_baselines.policy.checkpoint import (
     SHIPPED_PREFIX,
     Checkpoint,
@@ -64,6 +65,12 @@ FIRST_SEED = 1000
 
 VIDEOS = "videos"
 
+SOFTWARE = ("mujoco", "numpy", "robo_manip_baselines", "torch")
+"""Software whose versions result rows hold."""
+
+DETECTOR = ("mediapipe",)
+"""Likewise, where the mouth is found in images."""
+
 OnEpisode = Callable[[EpisodeResult, Recording], None]
 
 
@@ -78,6 +85,9 @@ class EvaluationConfig:
         env_kwargs: arguments of the environment that differ from those of the demonstrations; held
             as JSON holds them. ``people`` is ``test`` after demonstrations of ``train`` people.
         corruption: of the observations, where it is not the one of the training; None otherwise.
+        mouth_source: of the observations, see `ObservationSpec`; a camera takes the place of every
+            corruption.
+        camera_latency: of that camera.
         temporal_ensemble: average the predictions of all chunks, whatever the checkpoint says.
         n_action_steps: actions of a chunk to execute before the next one, where it is not the
             number of the checkpoint; None otherwise.
@@ -100,6 +110,8 @@ class EvaluationConfig:
     out: Path | None = None
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     corruption: Corruption | None = None
+    mouth_source: str = "truth"
+    camera_latency: CameraLatency = 1
     temporal_ensemble: bool = False
     n_action_steps: Chunk | None = None
     strategy: str | None = None
@@ -189,6 +201,14 @@ class EvaluationPlan:
         spec = checkpoint.spec
         if config.corruption is not None:
             spec = replace(spec, corruption=config.corruption.pinned())
+        if config.mouth_source != "truth":
+            perception = {"mouth_source": config.mouth_source, "corruption": Corruption()}
+            spec = replace(spec, **perception, camera_latency=config.camera_latency)
+            if not spec.frames:
+                raise RequestError(
+                    f"mouth_source {spec.mouth_source}: the policy was trained with the preset "
+                    f"'{spec.obs}', which shows no mouth; leave it out"
+                )
         recorded = checkpoint.dataset.get("env_kwargs", {})
         if "motion_library" in config.env_kwargs:  # another file, of other content perhaps
             recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
@@ -199,8 +219,10 @@ class EvaluationPlan:
         env_kwargs = pin_library({**recorded, **config.env_kwargs})
         env = EnvConfig(checkpoint.env, spec, env_kwargs)
         xml_hash = _require_fit(checkpoint, env)
-        if (spec.cameras or config.videos) and (problem := opengl_problem()):
+        if needs_opengl(spec, config.videos) and (problem := opengl_problem()):
             why = "the policy sees images" if spec.cameras else "--video 0 needs no OpenGL"
+            if spec.sees_by_camera:
+                why = "the mouth is found in images"
             raise RequestError(f"{problem} ({why})")
         execution = choose_execution(checkpoint.execution, config)
         return cls(config, checkpoint, env, xml_hash, execution, choose_device(config.device))
@@ -221,6 +243,10 @@ class EvaluationPlan:
     def corruption_suffix(self) -> str:
         """Name of a corruption that is not the one of the training: ``_under_delay3``."""
         corruption = self.env.spec.corruption
+        if self.env.spec.sees_by_camera:
+            latency = self.env.spec.camera_latency
+            is_usual = latency == EvaluationConfig.camera_latency
+            return f"_under_{self.env.spec.mouth_source}" + ("" if is_usual else f"_{latency}")
         if corruption.is_same_as(self.checkpoint.spec.corruption):
             return ""
         return f"_under_{corruption.label or 'truth'}"
@@ -285,7 +311,7 @@ class EvaluationPlan:
             "observation": spec.to_json(),
             "train_seed": checkpoint.train_seed,
             "checkpoint": checkpoint.content_hash,
-            "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),
+            "versions": software_versions(*SOFTWARE, *(DETECTOR if spec.sees_by_camera else ())),
             "settings": settings,
         }
         return as_json(origin)
@@ -373,6 +399,11 @@ class EvaluationPlan:
             yield
         finally:
             torch.set_num_threads(before)
+
+
+def needs_opengl(spec: ObservationSpec, videos: int) -> bool:
+    """Return whether anything is drawn: for the policy, for the detector, or for videos."""
+    return bool(spec.cameras or spec.sees_by_camera or videos)
 
 
 def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummary, list[Path]]:

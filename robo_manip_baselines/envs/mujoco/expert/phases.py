@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import mink
 import numpy as np
@@ -279,7 +279,13 @@ class PhasedExpert:
         finger: m, position of a finger then.
         tool: frame that commands place, in that of the gripper, such as a spoon's; None for the
             gripper itself.
+
+    Attributes:
+        goes_by_observation: whether it sees the mouth as the environment observes it; others know
+            the truth.
     """
+
+    goes_by_observation: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -69,6 +69,9 @@ class FaceScene:
     def watch_contacts(self) -> None:
         """Read the contacts of one physics step."""
 
+    def watch_face(self, physics_step: int) -> None:
+        """Look at the face after so many physics steps of the episode, if it is time for it."""
+
     # -- start -------------------------------------------------------------------------------------
 
     def lay_out(
@@ -146,6 +149,7 @@ class FaceScene:
             mujoco.mj_step(self.model, self.data)
             self.touch.read(self.model, self.data)
             self.watch_contacts()
+            self.watch_face(self.step_count * self.substeps + substep + 1)
         self.step_count += 1
         if self._compliant_head:
             self._compliant_head.place_mouth(self.data)

@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.observation import Corruption, ObservedNames
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.observation.spec import ARMS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
@@ -330,13 +330,17 @@ class TaskEntry:
         """Make the metrics of one episode."""
         return load_part(self.metrics)()
 
-    def require_forecasts(self, corruption: Corruption) -> None:
+    def require_forecasts(self, spec: ObservationSpec) -> None:
         """Require that the target is the mouth, which is what is forecast, if forecasts are shown.
+
+        A camera shows forecasts, too.
 
         Raises:
             RequestError: it is another point of the face.
         """
+        corruption = spec.corruption
         shown = corruption.prediction != "truth" and f"prediction {corruption.prediction}"
+        shown = shown or (spec.sees_by_camera and f"mouth_source {spec.mouth_source}")
         shown = shown or (corruption.error == "model" and "error model")
         if shown and not self.predicted_field:
             raise RequestError(
@@ -428,6 +432,8 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "mouth_time": (str,),
     "arms": (str,),
     "corruption": (dict, type(None)),
+    "mouth_source": (str,),
+    "camera_latency": (int, str),
     "face": (str,),
     "face_motion": (str,),
     "motion": (str,),

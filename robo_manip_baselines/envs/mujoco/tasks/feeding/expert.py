@@ -208,9 +208,11 @@ class FeedingServo(FeedingExpert):
     Args:
         env: the environment, unwrapped.
         config: lead, delay and limits of the servo.
-        forecast: source of the mouth; the truth if None.
+        forecast: source of the mouth; what the environment observes, or else the truth, if None.
         execution: of its plans, from the insertion on.
     """
+
+    goes_by_observation = True
 
     def __init__(
         self,
@@ -222,7 +224,7 @@ class FeedingServo(FeedingExpert):
         super().__init__(env)
         usual = SPOON_SERVO if env.meal else ServoConfig()
         self._config = usual if config is None else config
-        self._forecast = self._truth if forecast is None else forecast
+        self._forecast = env.forecast_mouth if forecast is None else forecast
         self._execution = execution
 
     def branch(
@@ -267,6 +269,3 @@ class FeedingServo(FeedingExpert):
     def _seen(self, view: ExpertView) -> NDArray[np.float64]:
         """Return the newest mouth seen, (3,) m."""
         return self._forecast(view.time - self._config.delay * FRAME_PERIOD, 0.0)
-
-    def _truth(self, seen: float, ahead: float) -> NDArray[np.float64]:
-        return self._env.mouth_at(seen + ahead)
