@@ -98,12 +98,16 @@ class FaceScene:
         )
         # Of a physical face, the head moves by forces, and the mouth with it.
         placed = ("face/torso",) if self._compliant_head else self.replay.bodies
-        numbers = {self._mocap[body]: body for body in placed}
+        numbers = sorted(self._mocap[body] for body in placed)
         is_all = len(numbers) == self.model.nmocap
-        self._placed = slice(None) if is_all else sorted(numbers)  # a slice is much faster
-        bodies = [self.replay.bodies[numbers[number]] for number in sorted(numbers)]
-        self._positions = np.stack([position for position, _ in bodies], axis=1)  # (P, M, 3)
-        self._orientations = np.stack([turn for _, turn in bodies], axis=1)  # (P, M, 4)
+        self._placed = slice(None) if is_all else numbers  # a slice is much faster
+        # One array for all bodies, (P, M, 3) and (P, M, 4), of which each has its part.
+        names = sorted(placed, key=self._mocap.__getitem__)
+        bodies = self.replay.bodies
+        self._positions = np.stack([bodies[name][0] for name in names], axis=1)
+        self._orientations = np.stack([bodies[name][1] for name in names], axis=1)
+        for column, name in enumerate(names):
+            bodies[name] = self._positions[:, column], self._orientations[:, column]
         self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
 
