@@ -13,7 +13,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,15 @@ from robo_manip_baselines.benchmark.statistics.outcomes import (
     outcome_matrix,
 )
 from robo_manip_baselines.commands.train import parse_config
-from robo_manip_baselines.policy.checkpoint import read_checkpoint
+from robo_manip_baselines.policy.execution import PolicyRunner
+from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims
 from robo_manip_baselines.rollout.evaluation import (
     FIRST_SEED,
     EvaluationConfig,
-    EvaluationPlan,
     evaluate,
 )
 from robo_manip_baselines.rollout.results import Proportion, read_results
+from robo_manip_baselines.rollout.rollout import ActingPolicy
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.documents import convert, parse_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -68,11 +69,14 @@ OBSERVATIONS = {
 
 POLICIES = ("Act", "Mlp", "Diffusion", "Flow", "Sarnn")
 
-TABLE = "policies.md"
+TABLE, TIMES = "policies.md", "times.md"
 EPISODES, ROWS = "episodes", "rows"
 
 TIMED_STEPS = 20
 """Steps of training whose processor time is measured; the median counts."""
+
+TIMED_EPISODES = 4
+"""Demonstrations that are read to measure times alone."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,9 @@ class Options:
         seed: Seed of the first episode.
         num_envs: Episodes that run at once; results do not depend on it.
         workers: Processes in which environments step.
-        out: Folder of runs, results and table.
+        only_times: Only measure processor times, on the first demonstrations and untrained
+            networks: half a minute for all policies.
+        out: Folder of runs, results and tables.
     """
 
     dataset: Path
@@ -105,6 +111,7 @@ class Options:
     seed: Seed = FIRST_SEED
     num_envs: Episodes = 8
     workers: Processes = 2
+    only_times: bool = False
     out: Path = Path("results/policies")
 
     def __post_init__(self) -> None:
@@ -149,6 +156,16 @@ def run_name(policy: str, observation: str, train_seed: int) -> str:
     return f"{policy.lower()}_{observation}_seed{train_seed}"
 
 
+def configure(options: Options, policy: str, observation: str, train_seed: int) -> TrainConfig[Any]:
+    """Return the configuration of a training."""
+    folder = options.out / "runs" / run_name(policy, observation, train_seed)
+    words = [*OBSERVATIONS[observation], "--delay", str(options.delay)]
+    words += ["--preset", "cpu", "--seed", str(train_seed)]
+    words += [] if options.steps is None else ["--steps", str(options.steps)]
+    words += ["--dataset", str(options.dataset), "--logger", "none", "--out", str(folder)]
+    return parse_config([policy, *words])
+
+
 def run(options: Options, policy: str, observation: str, train_seed: int) -> Row:
     """Train, or continue; evaluate, or continue; and measure; or read what is done."""
     name = run_name(policy, observation, train_seed)
@@ -157,16 +174,11 @@ def run(options: Options, policy: str, observation: str, train_seed: int) -> Row
         done = read_row(file)
         if done.episodes == options.num_episodes:
             return done
-    folder = options.out / "runs" / name
-    words = [*OBSERVATIONS[observation], "--delay", str(options.delay)]
-    words += ["--preset", "cpu", "--seed", str(train_seed)]
-    words += [] if options.steps is None else ["--steps", str(options.steps)]
-    words += ["--dataset", str(options.dataset), "--logger", "none", "--out", str(folder)]
-    config = parse_config([policy, *words])
+    config = configure(options, policy, observation, train_seed)
     if train(config, resume=True):
         raise RequestError(f"the training of '{name}' was interrupted; call again to continue")
     evaluation = EvaluationConfig(
-        checkpoint=folder,
+        checkpoint=config.folder,
         seeds=range(options.seed, options.seed + options.num_episodes),
         out=options.out / EPISODES / name,
         num_envs=options.num_envs,
@@ -178,8 +190,8 @@ def run(options: Options, policy: str, observation: str, train_seed: int) -> Row
     row = Row(
         *(policy, observation, train_seed),
         sum(parameter.numel() for parameter in plan.model.parameters()),
-        time_training(config),
-        time_prediction(plan),
+        time_training(TrainSetup.load(config)),
+        time_prediction(plan.make_policy(1), plan.execution, plan.checkpoint.dims),
         *(summary.success, summary.strict_success, summary.success_safe, summary.episodes),
     )
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -196,10 +208,10 @@ def read_row(file: Path) -> Row:
     return convert(parse_json(file.read_text("utf-8"), f"'{file}'"), Row, f"'{file}'")
 
 
-def time_training(config: TrainConfig[Any]) -> float:
+def time_training(setup: TrainSetup) -> float:
     """Return s of one thread's processor time of a training, from the median of a few steps."""
     torch.set_num_threads(1)
-    setup, device = TrainSetup.load(config), torch.device("cpu")
+    config, device = setup.config, torch.device("cpu")
     state = TrainerState(setup.make_model(), config.training)
     step = TrainingStep(
         *(state.model.loss, state),
@@ -225,13 +237,13 @@ def time_training(config: TrainConfig[Any]) -> float:
     return statistics.median(times) * setup.total_steps
 
 
-def time_prediction(plan: EvaluationPlan, repeats: int = 50) -> tuple[float, float]:
+def time_prediction(
+    policy: ActingPolicy, execution: ActionExecution, dims: PolicyDims, repeats: int = 50
+) -> tuple[float, float]:
     """Return ms of one thread's processor time: of a prediction, and of the mean action."""
-    dims = read_checkpoint(plan.config.checkpoint).dims
     torch.set_num_threads(1)
-    policy, env = plan.make_policy(1), np.array([0])
+    env = np.array([0])
     policy.reset(env, [0])
-    execution = plan.execution
     every = 1 if execution.temporal_ensemble else execution.n_action_steps
     times: list[float] = []
     for _ in range(repeats * every):
@@ -239,6 +251,33 @@ def time_prediction(plan: EvaluationPlan, repeats: int = 50) -> tuple[float, flo
         policy.act(np.zeros((1, dims.state), np.float32), None, env)
         times.append(1e3 * (time.process_time() - begin))
     return float(np.median(times[::every])), float(np.mean(times))
+
+
+def times_table(options: Options) -> str:
+    """Measure processor times without any training; return a Markdown table."""
+    lines = [
+        "| policy | shown | weights | steps | a step of training, ms | training, s "
+        "| a prediction, ms | an action, ms |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for observation in options.observations:
+        for policy in options.policies:
+            config = configure(options, policy, observation, options.train_seeds[0])
+            setup = TrainSetup.load(replace(config, num_episodes=TIMED_EPISODES))
+            model, seconds = setup.make_model(), time_training(setup)
+            runner = PolicyRunner(
+                *(model, setup.demonstrations.spec, setup.normalization, config.execution),
+                encoding=setup.encoding,
+                skip=config.training.skip,
+                num_envs=1,
+            )
+            prediction, action = time_prediction(runner, config.execution, setup.dims)
+            weights = sum(parameter.numel() for parameter in model.parameters())
+            cells = [policy, observation, f"{weights:,}", str(setup.total_steps)]
+            cells += [f"{1e3 * seconds / setup.total_steps:.1f}", f"{seconds:.0f}"]
+            cells += [f"{prediction:.1f}", f"{action:.1f}"]
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def trainings_table(rows: Sequence[Row]) -> str:
@@ -326,6 +365,10 @@ def main() -> None:
     options = parse(Options, EXAMPLE)
     prepare_pytorch()
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.only_times:
+        write_text(options.out / TIMES, times_table(options))
+        print((options.out / TIMES).read_text("utf-8"))
+        return
     for train_seed in options.train_seeds:
         for observation in options.observations:
             for policy in options.policies:
