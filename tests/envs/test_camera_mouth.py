@@ -303,7 +303,7 @@ def test_a_missing_tracker_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_missing_model_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(detector.find_model, "__defaults__", ("http://localhost:9/none", "", None))
-    with pytest.raises(RequestError, match="no model at .* then put it there$"):
+    with pytest.raises(RequestError, match=r"no model at .* then put it there$"):
         make_env("FeedingEnv", **BLIND, mouth_source="camera")
 
 
