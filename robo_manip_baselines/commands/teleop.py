@@ -16,6 +16,7 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.spec import ImageSize
+from robo_manip_baselines.runs.browser import PageOptions
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError, require_printable
 from robo_manip_baselines.runs.progress import closing_table
@@ -30,7 +31,7 @@ Example: python bin/Teleop.py FeedingEnv --device replay --episodes dataset/Feed
 
 DESCRIPTION = "Steer the arms by hand, and record demonstrations."
 
-DEFAULT_DEVICE = "replay"
+DEFAULT_DEVICE = "web"
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class TeleopOptions:
 
     Attributes:
         env: Task, for example FeedingEnv.
-        device: Device of the person: replay, which plays recorded episodes back as a person would.
+        device: Device of the person: web, a page in the browser; or replay, which plays recorded
+            episodes back as if a person did it.
         arm: Arms that the person steers: right, left or both; if not given, those of the task.
         out: Folder of the episodes; if not given, dataset/teleop/<env>.
         num_episodes: Episodes, one for each seed from --seed on that has none yet.
@@ -83,6 +85,7 @@ class TeleopOptions:
         motion_library: File of recorded face motion, or extended, which ships, too.
         images: Images of the episodes.
         replay: Only with --device replay.
+        page: Only with --device web.
     """
 
     env: tyro.conf.Positional[str]
@@ -101,6 +104,7 @@ class TeleopOptions:
     motion_library: Path | None = None
     images: tyro.conf.OmitArgPrefixes[ImageOptions] = field(default_factory=ImageOptions)
     replay: tyro.conf.OmitArgPrefixes[ReplayOptions] = field(default_factory=ReplayOptions)
+    page: tyro.conf.OmitArgPrefixes[PageOptions] = field(default_factory=PageOptions)
 
     def __post_init__(self) -> None:
         require_printable("--operator", self.operator)
@@ -134,6 +138,7 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
         quality=images.image_quality,
         env_kwargs=face_arguments(options),
         episodes=options.replay.episodes,
+        page=options.page,
     )
 
 

@@ -14,6 +14,7 @@ import hmac
 import http.client
 import io
 import ipaddress
+import logging
 import os
 import re
 import secrets
@@ -169,6 +170,8 @@ def serve_page(options: PageOptions, label: str) -> Iterator[tuple[viser.ViserSe
         def request_share_url(self, verbose: bool = True) -> str | None:
             """Refuse what a visitor may ask for: a public address of this page."""
 
+    # It tells of every connection, and of the request that `_require_guarded` makes.
+    logging.getLogger("websockets").setLevel(logging.WARNING)
     _require_free(options)
     gate = Gate(options.host, options.secret)
     with _guarded(gate), contextlib.redirect_stdout(io.StringIO()):  # viser prints its address

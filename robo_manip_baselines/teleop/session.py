@@ -241,7 +241,7 @@ class TeleopSession:
         self._mode = Mode.REVIEW
         self._episode_missed, self._episode_rate = self._pace.missed, self._pace.mean_rate
         result = "success" if self._info["is_success"] else "no success"
-        self._message = f"the episode has ended: {result}; save it, discard it, or do it again"
+        self._message = f"the episode has ended: {result}; save, redo or discard it"
 
     def _save(self) -> None:
         assert self._recorder is not None

@@ -14,7 +14,7 @@ from annotated_types import Interval
 from robo_manip_baselines.data import EpisodeReader, list_episodes
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
-from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     TaskEntry,
     make_env,
@@ -27,6 +27,7 @@ from robo_manip_baselines.rollout.demonstrate import (
     refuse_other_settings,
     require_demonstrations_folder,
 )
+from robo_manip_baselines.runs.browser import PageOptions
 from robo_manip_baselines.runs.documents import as_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import locked
@@ -60,6 +61,7 @@ class TeleopConfig:
         cameras, image_size, codec, quality: of the recorded images.
         env_kwargs: further arguments of the environment.
         episodes: files, or folders of them, for the device ``replay``.
+        page: address of the page of the device ``web``.
 
     Raises:
         RequestError: a value is not valid.
@@ -79,6 +81,7 @@ class TeleopConfig:
     quality: Quality = DEFAULT_QUALITY
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     episodes: tuple[Path, ...] = ()
+    page: PageOptions = field(default_factory=PageOptions)
 
     def __post_init__(self) -> None:
         require_choice("device", self.device, DEVICES)
@@ -132,7 +135,7 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
         }
         refuse_other_settings(config.out, wanted)
         refuse_other_settings(config.out / "unrendered", wanted)
-        device = open_device(config, kwargs)
+        device = open_device(config, kwargs, world)
         with (
             contextlib.closing(device),
             locked(config.out, is_kept=False),
@@ -156,12 +159,13 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
     return summary
 
 
-def open_device(config: TeleopConfig, kwargs: Mapping[str, Any]) -> TeleopDevice:
+def open_device(config: TeleopConfig, kwargs: Mapping[str, Any], world: FaceEnv) -> TeleopDevice:
     """Open the device of a session.
 
     Args:
         config: of the session.
         kwargs: arguments of the environment, as files have them.
+        world: the environment, unwrapped.
 
     Raises:
         RequestError: it cannot be opened, or does not go with the rest; says what to do.
@@ -171,6 +175,11 @@ def open_device(config: TeleopConfig, kwargs: Mapping[str, Any]) -> TeleopDevice
         for path in paths:
             _require_same_world(path, config, kwargs)
         return make_device("replay", episodes=paths, arms=config.steered)
+    if config.device == "web":
+        shown = config.cameras or (() if opengl_problem() else CAMERAS)
+        return make_device(
+            "web", world=world, arms=config.steered, cameras=shown, page=config.page
+        )
     return make_device(config.device, arms=config.steered)
 
 
