@@ -29,20 +29,28 @@ from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_text
 from robo_manip_baselines.runs.metrics import read_metrics
-from robo_manip_baselines.runs.ranges import Count, Episodes, Processes, Seed
+from robo_manip_baselines.runs.ranges import Count, Episodes, NonNegativeInt, Processes, Seed
 from robo_manip_baselines.training.config import METRICS
 from robo_manip_baselines.training.requirements import prepare_pytorch
 from robo_manip_baselines.training.trainer import train
 
 EXAMPLE = "python benchmarks/policies.py --dataset dataset/dyskinetic --policies Act Flow"
 
+_FORECAST = ["--obs", "current_pred", "--horizon", "16", "--relative"]
+
 OBSERVATIONS = {
+    "default": ["--obs", "current_pred"],
     "current": ["--obs", "current"],
-    "forecast": ["--obs", "current_pred", "--horizon", "16", "--relative"],
+    "forecast": _FORECAST,
+    **{
+        f"forecast_{frame}_{time}": [*_FORECAST, "--mouth_frame", frame, "--mouth_time", time]
+        for frame in ("gripper", "actions", "both")
+        for time in ("now", "forecast")
+    },
 }
 """Name of an observation -> its options of ``bin/Train.py``."""
 
-POLICIES = ("Act", "Mlp", "Diffusion", "Flow")
+POLICIES = ("Act", "Mlp", "Diffusion", "Flow", "Sarnn")
 
 TABLE = "policies.md"
 
@@ -54,10 +62,12 @@ class Options:
     Attributes:
         dataset: Folder of demonstrations without images.
         policies: Policies.
-        observations: current, or forecast: the mouth now and in 16 frames.
+        observations: default, that of the quick start (the mouth now and in 2 frames); current;
+            forecast: the mouth now and in 16 frames; or forecast_FRAME_TIME, with a mouth_frame and
+            a mouth_time.
         delay: Frames by which the mouth is observed late.
         train_seeds: Seeds of the trainings.
-        steps: Optimiser steps of each training.
+        steps: Optimiser steps of each training; those of the preset if not given.
         num_episodes: Episodes of each evaluation.
         seed: Seed of the first episode.
         num_envs: Episodes that run at once; results do not depend on it.
@@ -67,11 +77,11 @@ class Options:
 
     dataset: Path
     policies: tuple[str, ...] = POLICIES
-    observations: tuple[str, ...] = tuple(OBSERVATIONS)
-    delay: Episodes = 4
-    train_seeds: tuple[Seed, ...] = (0,)
-    steps: Count = 3000
-    num_episodes: Episodes = 100
+    observations: tuple[str, ...] = ("default",)
+    delay: NonNegativeInt = 0
+    train_seeds: tuple[Seed, ...] = (0, 1, 2)
+    steps: Count | None = None
+    num_episodes: Episodes = 200
     seed: Seed = FIRST_SEED
     num_envs: Episodes = 8
     workers: Processes = 2
@@ -93,7 +103,7 @@ class Row:
         parameters: of the network.
         seconds: of training.
         milliseconds: of processor time a prediction and an action, median of many.
-        success, strict_success: of the episodes.
+        success, strict_success, safe_success: of the episodes.
         episodes: how many.
     """
 
@@ -105,6 +115,7 @@ class Row:
     milliseconds: tuple[float, float]
     success: Proportion
     strict_success: Proportion
+    safe_success: Proportion | None
     episodes: int
 
 
@@ -113,7 +124,8 @@ def run(options: Options, policy: str, observation: str, train_seed: int) -> Row
     name = f"{policy.lower()}_{observation}_seed{train_seed}"
     folder = options.out / "runs" / name
     words = [*OBSERVATIONS[observation], "--delay", str(options.delay)]
-    words += ["--preset", "cpu", "--steps", str(options.steps), "--seed", str(train_seed)]
+    words += ["--preset", "cpu", "--seed", str(train_seed)]
+    words += [] if options.steps is None else ["--steps", str(options.steps)]
     words += ["--dataset", str(options.dataset), "--logger", "none", "--out", str(folder)]
     if train(parse_config([policy, *words]), resume=True):
         raise RequestError(f"the training of '{name}' was interrupted; call again to continue")
@@ -130,7 +142,7 @@ def run(options: Options, policy: str, observation: str, train_seed: int) -> Row
         sum(parameter.numel() for parameter in plan.model.parameters()),
         max(line.get("seconds", 0.0) for line in read_metrics(folder / METRICS)),
         time_prediction(plan),
-        *(summary.success, summary.strict_success, summary.episodes),
+        *(summary.success, summary.strict_success, summary.success_safe, summary.episodes),
     )
 
 
@@ -154,18 +166,20 @@ def table(rows: list[Row]) -> str:
     """Return a Markdown table, a row for each training."""
     lines = [
         "| policy | shown | training seed | weights | training, s | a prediction, ms "
-        "| an action, ms | success, % | strict success, % |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| an action, ms | success, % | strict success, % | safe success, % |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         cells: list[Any] = [r.policy, r.observation, r.train_seed, f"{r.parameters:,}"]
         cells += [f"{r.seconds:.0f}", *(f"{x:.1f}" for x in r.milliseconds)]
-        cells += [_percent(share) for share in (r.success, r.strict_success)]
+        cells += [_percent(share) for share in (r.success, r.strict_success, r.safe_success)]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _percent(share: Proportion) -> str:
+def _percent(share: Proportion | None) -> str:
+    if share is None:
+        return "-"
     values = (100.0 * (x or 0.0) for x in (share.rate, share.low, share.high))
     return "{:.0f} ({:.0f} to {:.0f})".format(*values)
 

@@ -1,4 +1,4 @@
-"""Inspect and verify a folder of episodes."""
+"""Inspect, verify, draw, compare, merge and split episodes."""
 
 from robo_manip_baselines.commands import run
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -53,6 +56,31 @@ def shared_dir() -> Path:
     if problem:
         pytest.skip(problem)
     return folder
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Headless Chromium, by Playwright; skips where there is none.
+
+    ``RMB_CHROMIUM`` names one that is in no folder of ``PATH``.
+    """
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    found = os.environ.get("RMB_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        pytest.skip("no Chromium: apt-get install chromium, or name one in $RMB_CHROMIUM")
+    flags = (
+        # As root, and in containers, there is no sandbox; the pages are ours.
+        *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync"),
+        *("--disable-background-networking", "--disable-component-update"),
+        # 3-D scenes without a GPU.
+        *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+        "--ignore-gpu-blocklist",
+    )
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=found, args=list(flags))
+        yield started
+        started.close()
 
 
 @pytest.fixture(scope="session")

@@ -176,7 +176,7 @@ class ConditionConfig:
 
     def observation(self, preset: ObservationSpec) -> ObservationSpec:
         """Return the spec of the policy: a preset's with the condition's settings in it."""
-        names = ("obs", "horizon", "relative", "corruption")
+        names = ("obs", "horizon", "relative", "mouth_frame", "mouth_time", "corruption")
         return replace(preset, **{name: getattr(self.spec, name) for name in names})
 
 

@@ -1,19 +1,27 @@
-"""``bin/Dataset.py``: inspect, verify and plot episodes."""
+"""``bin/Dataset.py``: inspect, verify, draw, compare, merge and split episodes."""
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean, stdev
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from annotated_types import Interval
 
+from robo_manip_baselines.runs.browser import PageOptions, require_viser
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.progress import closing_table
+from robo_manip_baselines.runs.ranges import NonNegativeInt, Seed
+
+if TYPE_CHECKING:
+    from robo_manip_baselines.data.comparison import ColumnDifference, EpisodeComparison
+    from robo_manip_baselines.data.curation import Copied
 
 EpisodeFolder = Annotated[
     Path,
@@ -83,6 +91,227 @@ class Plot:
             with atomic_file(out) as path:
                 figure.savefig(path, format=kind[1:], dpi=120)
         return f"written to '{out}'", 0
+
+
+@dataclass(frozen=True)
+class View:
+    """Show episodes in a browser: 3-D scene, cameras and curves, with one slider.
+
+    Attributes:
+        episodes: Episode files, or folders of them.
+        page: Address of the page.
+    """
+
+    episodes: Annotated[
+        tuple[Path, ...],
+        tyro.conf.arg(metavar="DIR|FILE [DIR|FILE ...]"),
+        tyro.conf.Positional,
+    ]
+    page: tyro.conf.OmitArgPrefixes[PageOptions] = field(default_factory=PageOptions)
+
+    def run(self) -> tuple[str, int]:
+        """Serve the page until the process is interrupted."""
+        require_viser("view")
+        from robo_manip_baselines.rollout.episode_page import serve_episodes
+
+        serve_episodes(_episode_files(self.episodes), self.page)
+        return "", 0
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Copy the episodes of several folders into a new one. Mixtures are refused.
+
+    Attributes:
+        folders: Folders of episode_*.hdf5 files; they are only read.
+        out: Folder to make; provenance.json in it says where each episode comes from.
+    """
+
+    folders: Annotated[
+        tuple[Path, ...], tyro.conf.arg(metavar="DIR DIR [DIR ...]"), tyro.conf.Positional
+    ]
+    out: Path
+
+    def run(self) -> tuple[str, int]:
+        """Return the text to print and the exit code."""
+        from robo_manip_baselines.data.curation import merge_datasets
+
+        return _copied_text(merge_datasets(self.folders, self.out)), 0
+
+
+@dataclass(frozen=True)
+class Split:
+    """Copy the demonstrations of a folder into train/ and validation/ of a new one.
+
+    Attributes:
+        folder: Folder of episode_*.hdf5 files; it is only read. Failures are left out.
+        out: Folder to make; provenance.json in it says where each episode comes from.
+        fraction: Share of the episodes to hold out for validation.
+        seed: Seed of the random choice.
+        by: What stays together: episode, or person, so that nobody is in both parts.
+    """
+
+    folder: EpisodeFolder
+    out: Path
+    fraction: Annotated[float, Interval(gt=0.0, lt=1.0)] = 0.2
+    seed: Seed = 0
+    by: str = "episode"
+
+    def run(self) -> tuple[str, int]:
+        """Return the text to print and the exit code."""
+        from robo_manip_baselines.data.curation import SplitRequest, split_dataset
+
+        request = SplitRequest(self.fraction, self.seed, self.by)
+        return _copied_text(split_dataset(self.folder, self.out, request)), 0
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare two episodes, number by number. Ends with 1 if they differ.
+
+    Attributes:
+        one: An episode_*.hdf5 file.
+        other: Another one.
+        columns: Most columns of an array to list; 0 for all.
+    """
+
+    one: Annotated[Path, tyro.conf.arg(metavar="FILE"), tyro.conf.Positional]
+    other: Annotated[Path, tyro.conf.arg(metavar="FILE"), tyro.conf.Positional]
+    columns: NonNegativeInt = 8
+
+    def run(self) -> tuple[str, int]:
+        """Return the text to print and the exit code."""
+        from robo_manip_baselines.data.comparison import compare_episodes
+        from robo_manip_baselines.data.episode import EpisodeReader
+
+        with EpisodeReader(self.one) as one, EpisodeReader(self.other) as other:
+            found = compare_episodes(one, other)
+        return comparison_text(found, (str(self.one), str(self.other)), self.columns), int(
+            not found.is_same
+        )
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Play the videos of evaluations at once: a row for each condition, a column for each seed.
+
+    Attributes:
+        folders: Folders of Rollout.py --policy --video, or a folder above several of them.
+        out: Video to write, .mp4.
+        view: View of each video: top, angle, front_close, front_close_zoom, or all of them.
+        width: Width of a tile in pixels.
+        columns: Most seeds to show.
+    """
+
+    folders: Annotated[
+        tuple[Path, ...], tyro.conf.arg(metavar="DIR [DIR ...]"), tyro.conf.Positional
+    ]
+    out: Path = Path("tiles.mp4")
+    view: str = "angle"
+    width: Annotated[int, Interval(ge=64, le=4096)] = 320
+    columns: Annotated[int, Interval(ge=1, le=64)] = 4
+
+    def run(self) -> tuple[str, int]:
+        """Return the text to print and the exit code."""
+        from robo_manip_baselines.rollout.tiling import find_tiles, write_tiles
+        from robo_manip_baselines.runs.files import locked_file, require_out_file
+        from robo_manip_baselines.runs.videos import VIDEO
+
+        _require_folders(self.folders, "results/...")
+        tiling = find_tiles(self.folders, self.columns)
+        shown = [path for row in tiling.rows.values() for path, _ in row.values()]
+        require_out_file(self.out, VIDEO, shown)
+        with locked_file(self.out):
+            write_tiles(self.out, tiling, view=self.view, width=self.width)
+        size = f"{len(tiling.rows)} conditions, {len(tiling.seeds)} seeds"
+        return f"written to '{self.out}': {size}", 0
+
+
+def _require_folders(folders: Sequence[Path], example: str) -> None:
+    if not folders:
+        raise RequestError(f"which folder? name one or more, for example {example}")
+    for folder in folders:
+        if not folder.is_dir():
+            raise RequestError(f"'{folder}' is no folder; name a folder")
+
+
+def _episode_files(given: Sequence[Path]) -> list[Path]:
+    """Return the files that are named, and those of the folders that are named, failures last."""
+    from robo_manip_baselines.data.files import list_episodes, list_failures
+
+    paths: list[Path] = []
+    for path in given:
+        paths += list_episodes(path) + list_failures(path) if path.is_dir() else [path]
+    if not paths:
+        names = ", ".join(f"'{path}'" for path in given)
+        what = f"{names} holds no episode_*.hdf5 file" if given else "no episode is named"
+        raise RequestError(f"{what}; name files, or a folder that holds some")
+    return paths
+
+
+def _copied_text(copied: Copied) -> str:
+    rows = {}
+    for folder, number in copied.demonstrations.items():
+        failures = copied.failures[folder]
+        kept = f" and {failures} failures" if failures else ""
+        rows[str(folder)] = f"{number} demonstrations{kept}"
+    if copied.duplicates:
+        rows["taken once"] = f"{copied.duplicates} that were there twice"
+    rows["copied now"] = str(copied.new)
+    return closing_table(rows)
+
+
+def comparison_text(found: EpisodeComparison, names: tuple[str, str], columns: int = 8) -> str:
+    """Return what differs between two episodes, for people to read.
+
+    Args:
+        found: differences.
+        names: of the episodes.
+        columns: most lines for one array; 0 for all.
+    """
+    if found.is_same:
+        return f"the same: {found.lengths[0]} steps, every attribute, number and image"
+    lines: list[str] = []
+    if found.lengths[0] != found.lengths[1]:
+        fewer = min(found.lengths)
+        lines.append(
+            f"steps: {found.lengths[0]} and {found.lengths[1]}; the first {fewer} compared"
+        )
+    for name, (one, other) in found.attributes.items():
+        lines.append(f"attribute {name}: {_short(one)} and {_short(other)}")
+    lines += [f"{name}: only in {names[place]}" for name, place in found.only_in.items()]
+    lines += [f"{name}: shapes {one} and {other}" for name, (one, other) in found.shapes.items()]
+    if found.columns:
+        rows = [("array", "column", "first step", "steps", "max", "rms", "unit")]
+        for name, group in itertools.groupby(found.columns, key=lambda item: item.field):
+            items = list(group)
+            listed = items[:columns] if columns else items
+            rows += [_column_row(item) for item in listed]
+            if len(items) > len(listed):
+                rows.append((name, f"… {len(items) - len(listed)} more", *[""] * 5))
+        lines += _aligned(rows)
+    for image in found.images:
+        mean = "" if image.mean is None else f", mean difference {image.mean:.2f} of 255"
+        first = f"first at step {image.first_step}"
+        lines.append(f"images of {image.camera}: {image.steps} differ, {first}{mean}")
+    if found.first_step is not None:
+        lines.append(f"first difference at step {found.first_step}")
+    return "\n".join(lines)
+
+
+def _column_row(item: ColumnDifference) -> tuple[str, ...]:
+    numbers = str(item.first_step), str(item.steps), f"{item.largest:.3g}", f"{item.rms:.3g}"
+    return item.field, item.column, *numbers, item.unit
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:60]}…"
 
 
 def dataset_info(folder: Path) -> dict[str, str]:
@@ -158,10 +387,15 @@ def _spread(values: list[float]) -> str:
     return f"{mean(values):.2f} ± {deviation:.2f} s (mean ± sd of {n}; {ends})"
 
 
+COMMANDS = Info | Verify | Plot | View | Merge | Split | Compare | Tile
+"""Subcommands, in the order of --help."""
+
+
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Dataset.py``."""
     example = "python bin/Dataset.py verify dataset/FeedingEnv"
-    description = "Inspect, verify and plot episodes."
-    text, code = parse(Verify | Info | Plot, example, description=description, args=args).run()
-    print(text)  # noqa: T201
+    description = "Inspect, verify, draw, compare, merge and split episodes."
+    text, code = parse(COMMANDS, example, description=description, args=args).run()
+    if text:
+        print(text)  # noqa: T201
     return code

@@ -15,7 +15,7 @@ import tyro
 
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.registry import policy_names, policy_presets
-from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.checkpoints import BEST, list_checkpoints
 from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.documents import shown
 from robo_manip_baselines.runs.errors import RequestError, require_choice
@@ -174,6 +174,8 @@ def summary(config: TrainConfig[Any], first_step: int) -> str:
         "held out": losses["validation"],
         "written to": str(config.folder),
     }
+    if best := list_checkpoints(config.folder / BEST):
+        rows["best held out"] = f"step {best[-1][0]}, in {config.folder / BEST}"
     return closing_table(rows)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,7 +73,7 @@ def verify_dataset(folder: str | Path, *, images: bool = True) -> list[Problem]:
         for of_one_file in track(found, len(paths), "file"):
             problems += of_one_file
     metadata = {path: _metadata(path) for path in paths}
-    problems += _mixed(metadata) + _misplaced(metadata)
+    problems += mixture_problems(metadata) + _misplaced(metadata)
     text, leftovers = "left by a run that was killed; may be deleted", folder.glob("**/.*.partial")
     return problems + [Problem(path, text, True) for path in sorted(leftovers)]
 
@@ -87,8 +87,12 @@ def _metadata(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _mixed(metadata: dict[Path, dict[str, Any]]) -> list[Problem]:
-    """Files that differ from most others in what all of them should share."""
+def mixture_problems(metadata: Mapping[Path, Mapping[str, Any]]) -> list[Problem]:
+    """Return the files that differ from most others in what the episodes of a folder share.
+
+    Args:
+        metadata: attributes of each file, as far as they can be read.
+    """
     problems: list[Problem] = []
     for name in (*SHARED_ATTRIBUTES, _MAY_DIFFER):
         values = {

@@ -19,6 +19,7 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 from tyro.constructors import PrimitiveConstructorSpec
 
+from robo_manip_baselines.observation.arm import ARM_JOINTS
 from robo_manip_baselines.observation.corruption import Corruption, CorruptionPipeline
 from robo_manip_baselines.observation.state import (
     FRAME_PERIOD,
@@ -38,11 +39,14 @@ HISTORY_FRAMES = 5
 CAMERAS = ("top", "angle", "front_close")
 """The paper's three views (Fig. 8)."""
 
-ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
-"""Joints of an arm, base to gripper, in the order of state and action."""
-
 ARMS: dict[str, tuple[str, ...]] = {"right": ("right",), "both": ("left", "right")}
 """Arms that a policy moves and observes, in the order of state and action."""
+
+MOUTH_FRAMES = ("none", "gripper", "actions", "both")
+"""What is expressed relative to the mouth."""
+
+MOUTH_TIMES = ("now", "forecast")
+"""Mouth that it is relative to: the one observed, or the one forecast for when an action acts."""
 
 MAX_IMAGE_SIZE = 4096
 
@@ -108,6 +112,11 @@ class ObservationSpec:
         object_pose: Show the positions of the task's objects.
         arms: Arms in state and action: right or both.
         relative: Show the mouth in past and future frames relative to the present one.
+        mouth_frame: What is expressed relative to the mouth: none, gripper (its position is also
+            observed from the mouth), actions (the policy predicts the gripper's position from the
+            mouth in place of waist, shoulder and elbow) or both.
+        mouth_time: Mouth of the mouth_frame: now, the one observed, or with current_pred forecast,
+            for the time at which the arm is where an action sends it.
         corruption: Corruption of the target between simulator and policy.
 
     Raises:
@@ -122,6 +131,8 @@ class ObservationSpec:
     object_pose: bool = False
     arms: str = "right"
     relative: bool = False
+    mouth_frame: str = "none"
+    mouth_time: str = "now"
     corruption: Corruption = field(default_factory=Corruption)
 
     def __post_init__(self) -> None:
@@ -140,6 +151,7 @@ class ObservationSpec:
         # The other presets show the present frame alone.
         has_frames = self.obs in ("current_pred", "history")
         object.__setattr__(self, "relative", bool(self.relative) and has_frames)
+        self._check_mouth_frame()
         object.__setattr__(self, "image_size", _checked_size("image size", self.image_size))
         self._check_render_size()
         if not isinstance(self.corruption, Corruption):
@@ -165,6 +177,23 @@ class ObservationSpec:
                 "too)"
             )
 
+    def _check_mouth_frame(self) -> None:
+        """Check what is relative to the mouth; a time without it becomes ``now``."""
+        require_choice("mouth frame", self.mouth_frame, MOUTH_FRAMES)
+        require_choice("mouth time", self.mouth_time, MOUTH_TIMES)
+        if self.mouth_frame == "none":
+            object.__setattr__(self, "mouth_time", "now")
+        elif not self.frames:
+            raise RequestError(
+                f"mouth_frame '{self.mouth_frame}': the observation preset '{self.obs}' shows no "
+                "mouth; choose current, history or current_pred"
+            )
+        elif self.mouth_time == "forecast" and self.obs != "current_pred":
+            raise RequestError(
+                f"mouth_time 'forecast': the observation preset '{self.obs}' shows no forecast; "
+                "choose current_pred, or the mouth_time now"
+            )
+
     def _check_render_size(self) -> None:
         """Check ``render_size``; the same as ``image_size`` becomes None."""
         if self.render_size is None:
@@ -186,8 +215,9 @@ class ObservationSpec:
             del values["render_size"]
         arms, corruption = values.pop("arms"), values.pop("corruption")
         values |= {"error": self.corruption.error, "arms": arms}
-        if not self.relative:
-            del values["relative"]
+        for name in ("relative", "mouth_frame", "mouth_time"):
+            if values[name] in (False, "none", "now"):
+                del values[name]
         if self.corruption.prediction == "truth":
             del corruption["prediction"]
         return values | {"corruption": corruption} if self.corruption else values
@@ -214,7 +244,9 @@ class ObservationSpec:
         horizon = f"_h{self.horizon}" if self.obs == "current_pred" else ""
         corruption = f"_{self.corruption.label}" if self.corruption else ""
         relative = "_relative" if self.relative else ""
-        return f"{self.obs}{horizon}{relative}{corruption}"
+        mouth = "" if self.mouth_frame == "none" else f"_mouth_{self.mouth_frame}"
+        ahead = "_forecast" if self.mouth_time == "forecast" else ""
+        return f"{self.obs}{horizon}{relative}{mouth}{ahead}{corruption}"
 
     @property
     def drawn_size(self) -> tuple[int, int]:
@@ -239,6 +271,16 @@ class ObservationSpec:
         """Number of earlier reports of the target that the preset shows."""
         return HISTORY_FRAMES if self.obs == "history" else 0
 
+    @property
+    def shows_gripper(self) -> bool:
+        """True if the gripper's position from the mouth is shown."""
+        return self.mouth_frame in ("gripper", "both")
+
+    @property
+    def moves_gripper(self) -> bool:
+        """True if actions have the gripper's position from the mouth."""
+        return self.mouth_frame in ("actions", "both")
+
     def components(self, names: ObservedNames) -> dict[str, tuple[str, ...]]:
         """Return the names of the elements of every vector of the observation, in order."""
         parts = {"state": tuple(_state_names(self.arm_names))}
@@ -251,6 +293,10 @@ class ObservationSpec:
             steps = range(self.frames)
             points = [f"{axis}_{k}" for k in steps for axis in "txyz"]
             parts["prediction"] = (*points, *(f"distance_{k}" for k in steps))
+        if self.shows_gripper:
+            steps = [f"_{k}" for k in range(self.frames)] if self.mouth_time == "forecast" else [""]
+            place = f"gripper from {names.target}"
+            parts[place.replace(" ", "_")] = tuple(f"{place} {a}{k}" for k in steps for a in "xyz")
         if self.object_pose:
             objects = [f"{item} {axis}" for item in names.objects for axis in "xyz"]
             parts["object_position"] = tuple(objects)
@@ -292,7 +338,8 @@ class ObservationSpec:
         parts = [arms.reshape(*arms.shape[:-2], -1)]
         if self.frames:
             position = observed.position[..., : self.frames, :]
-            distance = np.linalg.norm(position - state.end_effector_position[..., None, :], axis=-1)
+            gripper = state.end_effector_position[..., None, :] - position
+            distance = np.linalg.norm(gripper, axis=-1)
             past = observed.past
             if self.relative:
                 now = position[..., :1, :]
@@ -306,6 +353,9 @@ class ObservationSpec:
                 time = observed.time[..., None] + np.arange(self.frames) * FRAME_PERIOD
                 timed = np.concatenate([time[..., None], position], axis=-1)
                 parts += [timed.reshape(*timed.shape[:-2], -1), distance]
+            if self.shows_gripper:
+                gripper = gripper if self.mouth_time == "forecast" else gripper[..., :1, :]
+                parts.append(gripper.reshape(*gripper.shape[:-2], -1))
         if self.object_pose:
             objects = state.object_position
             parts.append(objects.reshape(*objects.shape[:-2], -1))
@@ -320,15 +370,25 @@ class ObservationSpec:
         return dict(zip(components, np.split(vector, ends[:-1], axis=-1), strict=True))
 
     def target_positions(self, vector: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Return the target positions, (F, 3) m, in a packed vector (S,); F is 0 for baseline."""
+        """Return the target positions, (..., F, 3) m, in packed vectors (..., S).
+
+        F is 0 for baseline.
+        """
         start = len(_state_names(self.arm_names))
         if self.obs in ("current", "history"):
-            return vector[None, start : start + 3].astype(np.float64)
-        timed = vector[start : start + 4 * self.frames].reshape(-1, 4)
-        positions = timed[:, 1:].astype(np.float64)
+            return vector[..., None, start : start + 3].astype(np.float64)
+        timed = vector[..., start : start + 4 * self.frames].astype(np.float64)
+        positions = timed.reshape(*vector.shape[:-1], self.frames, 4)[..., 1:]
         if self.relative:
-            positions[1:] += positions[:1]
+            positions[..., 1:, :] += positions[..., :1, :]
         return positions
+
+    @property
+    def posture_places(self) -> list[int]:
+        """Places (A,) in the packed vector of what the A elements of an action are targets of."""
+        names = _state_names(self.arm_names)
+        parts = (*ARM_JOINTS, "gripper")
+        return [names.index(f"{arm}/{part} position") for arm in self.arm_names for part in parts]
 
 
 def _camera_names(given: object) -> tuple[str, ...]:

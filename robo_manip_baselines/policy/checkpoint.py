@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from typing_extensions import TypedDict
 
+from robo_manip_baselines.data.actions import ActionEncoding
 from robo_manip_baselines.data.demonstrations import Split
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec
@@ -125,6 +126,12 @@ class Checkpoint:
     dataset: DatasetFacts
     versions: dict[str, str]
     content_hash: str = ""
+
+    @property
+    def encoding(self) -> ActionEncoding:
+        """Encoding of the actions that the network predicts."""
+        step = self.settings.skip * self.control_period
+        return ActionEncoding(self.spec, step, self.settings.relative_actions)
 
 
 def shipped_checkpoints() -> list[str]:

@@ -16,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from robo_manip_baselines.data.actions import ActionEncoding
 from robo_manip_baselines.data.normalization import Normalization
-from robo_manip_baselines.observation import ARM_JOINTS, ObservationSpec, ObservedNames
+from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.policy.cuda_graph import Replay
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import STRATEGIES, ActionExecution
@@ -243,6 +244,19 @@ def soft_weights(chunk_size: int, delay: int, left: NDArray[np.intp]) -> NDArray
     return np.where(step < left[:, None], weights, 0.0).astype(np.float32)
 
 
+def interpolated(chunks: NDArray[np.float32], skip: int) -> NDArray[np.float32]:
+    """Return chunks (m, K skip, A) for every control step, of those (m, K, A) for every skip-th.
+
+    Targets are interpolated linearly; the last one is held.
+    """
+    if skip == 1:
+        return chunks
+    after = np.concatenate([chunks[:, 1:], chunks[:, -1:]], axis=1)
+    share = (np.arange(skip, dtype=np.float32) / skip)[:, None]
+    between = chunks[:, :, None] + share * (after - chunks)[:, :, None]
+    return between.reshape(len(chunks), -1, chunks.shape[-1]).astype(np.float32, copy=False)
+
+
 INFERENCE_PRECISIONS = ("fp32", "bf16")
 
 TILE = 8
@@ -262,6 +276,8 @@ class PolicyRunner:
         spec: of the observations.
         normalization: of the demonstrations that it was trained on.
         execution: of its chunks.
+        encoding: of the actions that it predicts; None for targets of the joints.
+        skip: control steps between two actions of its chunks, and two observations of its window.
         num_envs: n.
         device: of the network.
         precision: ``fp32``, or ``bf16`` for the products inside the network.
@@ -278,6 +294,8 @@ class PolicyRunner:
         normalization: Normalization,
         execution: ActionExecution,
         *,
+        encoding: ActionEncoding | None = None,
+        skip: int = 1,
         num_envs: int,
         device: torch.device | str = "cpu",
         precision: str = "fp32",
@@ -291,18 +309,23 @@ class PolicyRunner:
         if spec.cameras:
             self._model = self._model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._has_images, self._normalization = bool(spec.cameras), normalization
-        self._chunk_shape = model.chunk_size, len(normalization.action_mean)
+        # Encoded actions are decoded when they are predicted: what they are relative to changes.
+        self._encoding, self._skip = encoding or None, skip
+        self._chunk_shape = model.chunk_size * skip, len(normalization.action_mean)
         self._buffer = make_action_buffer(execution, num_envs, *self._chunk_shape)
         self._execution = execution
-        _require_strategy(model, execution)
-        # Places in the state of what actions are targets of, and the last targets, normalised.
-        self._posture = posture_places(spec)
+        _require_strategy(model, execution, skip)
+        # Places in the state of what actions are targets of, and the last targets, in the units of
+        # the buffer: those of the environment where actions are encoded, normalised otherwise.
+        self._posture = spec.posture_places
         self._targets = np.zeros((num_envs, self._chunk_shape[1]), np.float32)
         steps, state_size = model.n_obs_steps, len(normalization.state_mean)
         image_shape = (steps, len(spec.cameras), *spec.image_size, 3)
-        # The last O observations, the seed and the control step of every environment.
-        self._states = np.zeros((num_envs, steps, state_size), np.float32)
-        self._images = np.zeros((num_envs, *image_shape), np.uint8)
+        # The last observations, of which O are shown, the seed and the control step of every
+        # environment.
+        kept = (steps - 1) * skip + 1
+        self._states = np.zeros((num_envs, kept, state_size), np.float32)
+        self._images = np.zeros((num_envs, kept, *image_shape[1:]), np.uint8)
         self._seeds = np.zeros(num_envs, np.int64)
         self._steps = np.zeros(num_envs, np.int64)
         rows = tile or (1 if self._device.type == "cpu" and spec.cameras else TILE)
@@ -320,8 +343,8 @@ class PolicyRunner:
         )
         # Of the chunk that goes on while the next one is predicted: actions, weights.
         self._chunk_tiles = (
-            torch.zeros(rows, *self._chunk_shape, pin_memory=pinned),
-            torch.zeros(rows, self._chunk_shape[0], pin_memory=pinned),
+            torch.zeros(rows, model.chunk_size, self._chunk_shape[1], pin_memory=pinned),
+            torch.zeros(rows, model.chunk_size, pin_memory=pinned),
         )
         self._chunk_inputs = tuple(tile.to(self._device) for tile in self._chunk_tiles)
         # On a CPU the inputs are the tiles themselves.
@@ -364,13 +387,15 @@ class PolicyRunner:
         self._steps[env_ids] += 1
         actions = self._buffer.act(env_ids, predicted, held)
         self._targets[env_ids] = actions
-        return self._normalization.unnormalize_action(actions)
+        return actions if self._encoding else self._normalization.unnormalize_action(actions)
 
     def _hold_posture(self, env_ids: EnvIds, vectors: NDArray[np.float32]) -> None:
         """Make the observed posture the target where an episode begins."""
         is_first = self._steps[env_ids] == 0
         posture = vectors[is_first][:, self._posture]
-        self._targets[env_ids[is_first]] = self._normalization.normalize_action(posture)
+        if not self._encoding:
+            posture = self._normalization.normalize_action(posture)
+        self._targets[env_ids[is_first]] = posture
 
     def _states_to_show(self, env_ids: EnvIds) -> NDArray[np.float32]:
         """Return the windows of states (b, O, S) that a prediction is made from.
@@ -378,17 +403,43 @@ class PolicyRunner:
         With roll_forward the joints are where they will be when the chunk is there: as much further
         as their targets will have moved, since an arm follows its targets with an even lag.
         """
-        states, delay = self._states[env_ids], self._execution.inference_delay
+        states, delay = self._states[env_ids, :: self._skip], self._execution.inference_delay
         if self._execution.name != "roll_forward" or not delay:
             return states
         assert isinstance(self._buffer, ActionQueue)
         actions, left = self._buffer.under_way(env_ids)
         change = np.where(left[:, None] > 0, actions[:, delay - 1] - self._targets[env_ids], 0.0)
-        scale = self._normalization.action_std / self._normalization.state_std[self._posture]
+        scale = 1.0 / self._normalization.state_std[self._posture]
+        if not self._encoding:
+            scale = self._normalization.action_std * scale
         states[:, :, self._posture] += (change * scale)[:, None].astype(np.float32)
         return states
 
-    def _fill_chunk_tiles(self, env_ids: EnvIds) -> None:
+    def _shown_vectors(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the packed observations (b, S) that windows (b, O, S) end with."""
+        return states[:, -1] * self._normalization.state_std + self._normalization.state_mean
+
+    def _to_execute(
+        self, chunks: NDArray[np.float32], states: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return predicted chunks (b, K, A) as the buffer takes them, for every control step."""
+        if self._encoding:
+            encoded = self._normalization.unnormalize_action(chunks)
+            decoded = self._encoding.decode(encoded, self._shown_vectors(states))
+            chunks = decoded.astype(np.float32)
+        return interpolated(chunks, self._skip)
+
+    def _as_predicted(
+        self, actions: NDArray[np.float32], states: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Undo `_to_execute`."""
+        actions = actions[:, :: self._skip]
+        if not self._encoding:
+            return actions
+        encoded = self._encoding.encode(actions, self._shown_vectors(states)).astype(np.float32)
+        return self._normalization.normalize_action(encoded)
+
+    def _fill_chunk_tiles(self, env_ids: EnvIds, states: NDArray[np.float32]) -> None:
         """Write what goes on while a chunk is predicted: the actions and their weights."""
         assert isinstance(self._buffer, ActionQueue)
         delay, size = self._execution.inference_delay, self._chunk_shape[0]
@@ -396,6 +447,7 @@ class PolicyRunner:
         weights = soft_weights(size, delay, left)
         if self._execution.name == "rtc_trained":
             weights = (np.arange(size) < np.minimum(delay, left)[:, None]).astype(np.float32)
+        actions, weights = self._as_predicted(actions, states), weights[:, :: self._skip]
         for tile, values in zip(self._chunk_tiles, (actions, weights), strict=True):
             tile[len(env_ids) :].zero_()
             tile.numpy()[: len(env_ids)] = values
@@ -409,13 +461,13 @@ class PolicyRunner:
 
     @torch.no_grad()
     def _predict(self, env_ids: EnvIds) -> NDArray[np.float32]:
-        """Return the chunks, normalised, (b, K, A), for at most one tile's worth of rows."""
-        count = len(env_ids)
+        """Return the chunks for the buffer, (b, K, A), for at most one tile's worth of rows."""
+        count, states = len(env_ids), self._states_to_show(env_ids)
         self._state_tile[count:].zero_()
-        self._state_tile.numpy()[:count] = self._states_to_show(env_ids)
+        self._state_tile.numpy()[:count] = states
         if self._has_images:
             self._image_tile[count:].zero_()
-            self._image_tile.numpy()[:count] = self._images[env_ids]
+            self._image_tile.numpy()[:count] = self._images[env_ids, :: self._skip]
         if self._model.sample_noise_size:
             self._noise_tile[count:].zero_()
             for row, env in enumerate(env_ids):
@@ -423,14 +475,14 @@ class PolicyRunner:
                 generator = torch.Generator().manual_seed(seed)
                 self._noise_tile[row].normal_(generator=generator)
         if self._continues:
-            self._fill_chunk_tiles(env_ids)
+            self._fill_chunk_tiles(env_ids, states)
         tiles = self._state_tile, self._image_tile, self._noise_tile, *self._chunk_tiles
         for tile, there in zip(tiles, (*self._inputs, *self._chunk_inputs), strict=True):
             if there is not None and there is not tile:
                 there.copy_(tile, non_blocking=True)
         chunks = self._compute()
         # Waits for the GPU, so that the pinned memory is free for the next tile.
-        return chunks[:count].float().cpu().numpy()
+        return self._to_execute(chunks[:count].float().cpu().numpy(), states)
 
     @property
     def _continues(self) -> bool:
@@ -447,14 +499,7 @@ class PolicyRunner:
             return predict(*self._inputs, *self._chunk_inputs)
 
 
-def posture_places(spec: ObservationSpec) -> list[int]:
-    """Return the places (A,) in the packed observation of what the A actions are targets of."""
-    names = spec.components(ObservedNames())["state"]
-    parts = (*ARM_JOINTS, "gripper")
-    return [names.index(f"{arm}/{part} position") for arm in spec.arm_names for part in parts]
-
-
-def _require_strategy(model: PolicyModel, execution: ActionExecution) -> None:
+def _require_strategy(model: PolicyModel, execution: ActionExecution, skip: int) -> None:
     """Raise RequestError unless the network can act with the strategy and the delay."""
     kind, name, delay = type(model).__name__, execution.name, execution.inference_delay
     needs_model = ("rtc", "rtc_trained")
@@ -462,8 +507,9 @@ def _require_strategy(model: PolicyModel, execution: ActionExecution) -> None:
         valid = [s for s in STRATEGIES if s not in needs_model or s in model.strategies]
         how = "; rtc_trained is learnt with --max_prefix" if name in needs_model[1:] else ""
         raise RequestError(f"strategy '{name}': not with {kind}; valid: {', '.join(valid)}{how}")
-    if name == "rtc_trained" and delay > model.max_delay:
+    if name == "rtc_trained" and delay > model.max_delay * skip:
+        each = f" actions of {skip} control steps" if skip > 1 else ""
         raise RequestError(
-            f"inference_delay {delay}: must be at most the max_prefix {model.max_delay} that the "
-            "policy was trained with"
+            f"inference_delay {delay}: must be at most the max_prefix {model.max_delay}{each} that "
+            "the policy was trained with"
         )

@@ -80,12 +80,20 @@ class TrainSettings:
         clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
             for all its frames. A policy that can read the clock releases by the clock, whether or
             not it has reached the target.
+        action_noise: standard deviation of the Gaussian noise that is added, in training, to the
+            actions, in units of each element's own (RoboManipBaselines: ``--action_aug_std``).
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
         norm: normalisation of states and actions, ``mean_std``, ``min_max`` (to [-1, 1]),
             ``action_min_max`` (that of actions, the other of states) or ``none``; the policy's own
             if not given.
+        relative_actions: whether joint targets are predicted relative to the observed posture; the
+            gripper's stay as they are.
+        skip: control steps between two actions of a chunk, and between two observations of a
+            window (RoboManipBaselines: ``--skip``); between two actions, targets are interpolated.
+        early_stopping: validations without a smaller loss on the episodes held out after which the
+            training ends; 0 for none. The checkpoint of the smallest loss is kept in ``best``.
         precision: ``fp32``, ``bf16`` (autocast; losses and norms stay fp32), or ``auto``.
         compile: whether to use ``torch.compile``.
         cuda_graph: whether a single process on a CUDA device records its step once and replays it,
@@ -106,9 +114,13 @@ class TrainSettings:
     steps: Count | None = None
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
+    action_noise: Amount = 0.0
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
     norm: str | None = None
+    relative_actions: bool = False
+    skip: Annotated[int, Interval(ge=1, le=1000)] = 1
+    early_stopping: NonNegativeInt = 0
     precision: str = "auto"
     compile: bool = False
     cuda_graph: bool = True
@@ -120,6 +132,11 @@ class TrainSettings:
         if (self.epochs is None) == (self.steps is None):
             raise RequestError("give the budget as --epochs or as --steps, one of the two")
         require_ranges(self)
+        if self.early_stopping and not self.validation_fraction:
+            raise RequestError(
+                f"early_stopping {self.early_stopping}: no episodes are held out to stop by; give "
+                "a --validation_fraction, for example 0.1"
+            )
 
 
 @dataclass(frozen=True)

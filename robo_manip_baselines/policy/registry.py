@@ -55,6 +55,11 @@ POLICIES: dict[str, PolicyEntry] = {
         "robo_manip_baselines.policy.mlp.model:MlpModel",
         "robo_manip_baselines.policy.mlp.config:PRESETS",
     ),
+    "Sarnn": PolicyEntry(
+        "robo_manip_baselines.policy.sarnn.config:SarnnConfig",
+        "robo_manip_baselines.policy.sarnn.model:SarnnModel",
+        "robo_manip_baselines.policy.sarnn.config:PRESETS",
+    ),
     "Diffusion": PolicyEntry(
         "robo_manip_baselines.policy.diffusion.config:DiffusionConfig",
         "robo_manip_baselines.policy.diffusion.model:DiffusionModel",

@@ -318,7 +318,12 @@ class EvaluationPlan:
         checkpoint, precision = self.checkpoint, self.config.precision
         facts = checkpoint.spec, checkpoint.normalization, self.execution
         return PolicyRunner(
-            self.model, *facts, num_envs=num_envs, device=self.device, precision=precision
+            *(self.model, *facts),
+            encoding=checkpoint.encoding,
+            skip=checkpoint.settings.skip,
+            num_envs=num_envs,
+            device=self.device,
+            precision=precision,
         )
 
     def run(self, seeds: Sequence[int], on_episode: OnEpisode) -> None:

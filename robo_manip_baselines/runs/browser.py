@@ -173,6 +173,7 @@ def serve_page(options: PageOptions, label: str) -> Iterator[tuple[viser.ViserSe
     # It tells of every connection, and of the request that `_require_guarded` makes.
     logging.getLogger("websockets").setLevel(logging.WARNING)
     _require_free(options)
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor
     gate = Gate(options.host, options.secret)
     with _guarded(gate), contextlib.redirect_stdout(io.StringIO()):  # viser prints its address
         server = Server(options.host, options.port, label, verbose=False)

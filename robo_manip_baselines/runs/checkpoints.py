@@ -27,6 +27,9 @@ MANIFEST = "manifest.json"
 CHECKPOINTS = "checkpoints"
 """Folder of a run that holds its checkpoints."""
 
+BEST = "best"
+"""Folder of a run that holds its best checkpoint, laid out as a run folder."""
+
 _STEP_NAME = re.compile(r"step_(\d{8,})")
 
 
@@ -97,6 +100,13 @@ def prune_checkpoints(run: Path, kept: int) -> None:
     """Keep the newest checkpoints only."""
     for _, folder in list_checkpoints(run)[:-kept]:
         remove_folder(folder)
+
+
+def remove_later_checkpoints(run: Path, step: int) -> None:
+    """Remove the checkpoints of steps after ``step``."""
+    for later, folder in list_checkpoints(run):
+        if later > step:
+            remove_folder(folder)
 
 
 def read_manifest(folder: Path) -> dict[str, str]:

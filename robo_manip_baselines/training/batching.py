@@ -21,6 +21,7 @@ from annotated_types import Interval
 from numpy.typing import NDArray
 from torch import Tensor
 
+from robo_manip_baselines.data.actions import ActionEncoding
 from robo_manip_baselines.data.demonstrations import Demonstrations
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec, ObservedNames
@@ -119,7 +120,7 @@ class ExampleSampler:
 
 
 def chunk_rows(
-    offsets: Indices, episodes: Indices, starts: Indices, chunk_size: int
+    offsets: Indices, episodes: Indices, starts: Indices, chunk_size: int, skip: int = 1
 ) -> tuple[Indices, NDArray[np.bool_]]:
     """Return the rows of chunks of actions; past the end of an episode its last row is repeated.
 
@@ -128,22 +129,25 @@ def chunk_rows(
         episodes: (b,) index of each example's episode.
         starts: (b,) step of each example within its episode.
         chunk_size: K.
+        skip: steps between two actions.
 
     Returns:
         (b, K) rows, and (b, K) whether each is padding.
     """
-    rows = (offsets[episodes] + starts)[:, None] + np.arange(chunk_size)
+    rows = (offsets[episodes] + starts)[:, None] + skip * np.arange(chunk_size)
     end = offsets[episodes + 1][:, None]
     return np.minimum(rows, end - 1), rows >= end
 
 
-def window_rows(offsets: Indices, episodes: Indices, starts: Indices, n_obs_steps: int) -> Indices:
+def window_rows(
+    offsets: Indices, episodes: Indices, starts: Indices, n_obs_steps: int, skip: int = 1
+) -> Indices:
     """Return the rows (b, O) of windows of observations that end with each example's step.
 
     Before the start of an episode its first row is repeated. Arguments as in `chunk_rows`.
     """
     first = offsets[episodes][:, None]
-    rows = first + starts[:, None] + np.arange(1 - n_obs_steps, 1)
+    rows = first + starts[:, None] + skip * np.arange(1 - n_obs_steps, 1)
     return np.maximum(rows, first)
 
 
@@ -156,8 +160,9 @@ def step_noise(seed: int, stream: str, step: int, count: int, size: int) -> Tens
 class StateNoise:
     """Gaussian noise on normalised states: on proprioception and on the clock.
 
-    Target and objects are left as they are. ``robot`` is ``TrainSettings.state_noise``, ``clock``
-    ``TrainSettings.clock_noise``.
+    The gripper's position from the target is proprioception, too, with the same noise in each of
+    its frames. Target and objects are left as they are. ``robot`` is ``TrainSettings.state_noise``,
+    ``clock`` ``TrainSettings.clock_noise``.
     """
 
     def __init__(
@@ -167,6 +172,8 @@ class StateNoise:
         self._size = len(elements)
         self._robot_size = len(spec.components(names)["state"])  # they come first
         self._times = [i for i, name in enumerate(elements) if name.startswith("t_")]
+        start = f"gripper from {names.target} "
+        self._gripper = [i for i, name in enumerate(elements) if name.startswith(start)]
         self._robot, self._clock = robot, clock
 
     def draw(self, seed: int, step: int, count: int) -> Tensor | None:
@@ -178,6 +185,9 @@ class StateNoise:
         noise[:, : self._robot_size] = self._robot * drawn[:, : self._robot_size]
         # One clock: all times of an observation are off by the same.
         noise[:, self._times] = self._clock * drawn[:, self._robot_size :]
+        if self._gripper:
+            place = self._robot * step_noise(seed, "gripper", step, count, 3)
+            noise[:, self._gripper] = place.repeat(1, len(self._gripper) // 3)
         return noise
 
 
@@ -207,7 +217,10 @@ class BatchLoader:
         device: of the batches.
         rank: number of this process, from 0 on.
         world_size: processes that share each batch.
+        encoding: of the actions; None for targets of the joints.
+        skip: control steps between two actions of a chunk, and between observations of a window.
         state_noise: added to states; None for no noise.
+        action_noise: standard deviation of the noise that is added to normalised actions.
         images: None without cameras. Not closed by the loader.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
@@ -228,7 +241,10 @@ class BatchLoader:
         device: torch.device | str,
         rank: int = 0,
         world_size: int = 1,
+        encoding: ActionEncoding | None = None,
+        skip: int = 1,
         state_noise: StateNoise | None = None,
+        action_noise: float = 0.0,
         images: ImageStore | None = None,
         depth: int = 4,
     ) -> None:
@@ -244,12 +260,17 @@ class BatchLoader:
             )
         require_range("depth", depth, NonNegativeInt)
         self._sampler, self._model, self._seed = sampler, model, seed
-        self._state_noise = state_noise
+        self._state_noise, self._action_noise = state_noise, action_noise
+        self._encoding, self._skip = encoding or None, skip
         self._rank, self._world_size, self._depth = rank, world_size, depth
         self._offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sampler.lengths)])
         self._rows = demonstrations.rows(episodes)  # of the images, for each of the R steps
-        self._state = normalization.normalize_state(demonstrations.state[self._rows])
-        self._action = normalization.normalize_action(demonstrations.action[self._rows])
+        self._normalization, self._observed = normalization, demonstrations.state[self._rows]
+        self._state = normalization.normalize_state(self._observed)
+        action = demonstrations.action[self._rows]
+        if self._encoding:
+            action = self._encoding.columns(action).astype(np.float32)
+        self._action = normalization.normalize_action(action)
         self._images = images
         self._device = torch.device(device)
         self._stream: torch.cuda.Stream | None = None
@@ -291,8 +312,9 @@ class BatchLoader:
         examples = self._sampler.batch(step)
         count, n_obs_steps = len(examples), self._model.n_obs_steps
         episodes, starts = examples.T
-        chunks, is_pad = chunk_rows(self._offsets, episodes, starts, self._model.chunk_size)
-        windows = window_rows(self._offsets, episodes, starts, n_obs_steps)
+        places = self._offsets, episodes, starts
+        chunks, is_pad = chunk_rows(*places, self._model.chunk_size, self._skip)
+        windows = window_rows(*places, n_obs_steps, self._skip)
         noise = step_noise(self._seed, "noise", step, count, self._model.noise_size)
         part = part_of(count, self._rank, self._world_size)
         state_noise: Tensor | None = None
@@ -305,17 +327,42 @@ class BatchLoader:
             windows[part],
             chunks[part],
             state_noise,
+            self._action_change(step, part, windows[part, -1], state_noise),
             is_pad=torch.from_numpy(is_pad[part]),
             noise=noise[part],
             num_valid=torch.tensor(float((~is_pad).sum()) / self._world_size),
             num_examples=torch.tensor(count / self._world_size),
         )
 
+    def _action_change(
+        self, step: int, part: slice, rows: NDArray[np.int64], state_noise: Tensor | None
+    ) -> Tensor | None:
+        """Return what is added to normalised actions (b, K, A): noise, less their reference.
+
+        The reference is that of the observations with their noise: so a target relative to a
+        posture that is disturbed leads to where the demonstration went. None for no change.
+        """
+        change: Tensor | None = None
+        shape = self._model.chunk_size, self._action.shape[1]
+        if self._action_noise:
+            size = self._sampler.batch_size, math.prod(shape)
+            drawn = self._action_noise * step_noise(self._seed, "action", step, *size)
+            change = drawn.view(-1, *shape)[part]
+        if self._encoding:
+            scale, vectors = self._normalization, self._observed[rows]
+            if state_noise is not None:
+                vectors = vectors + state_noise[:, -1].numpy() * scale.state_std
+            reference = self._encoding.reference(vectors, shape[0]) / scale.action_std
+            taken = torch.from_numpy(reference.astype(np.float32))
+            change = -taken if change is None else change - taken
+        return change
+
     def _gather(
         self,
         windows: NDArray[np.int64],
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
+        change: Tensor | None,
         **others: Tensor,
     ) -> tuple[Batch, None]:
         """Gather rows in main memory.
@@ -328,6 +375,8 @@ class BatchLoader:
             state += state_noise
         images = None if self._images is None else torch.from_numpy(self._read_images(windows))
         action = torch.from_numpy(self._action[chunks])
+        if change is not None:
+            action += change
         return Batch(state=state, images=images, action=action, **others), None
 
     def _gather_on_device(
@@ -335,6 +384,7 @@ class BatchLoader:
         windows: NDArray[np.int64],
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
+        change: Tensor | None,
         **others: Tensor,
     ) -> tuple[Batch, torch.cuda.Event]:
         """Gather rows on the device, without waiting for it."""
@@ -356,6 +406,8 @@ class BatchLoader:
             if state_noise is not None:
                 state += copied(state_noise)
             action = self._device_action[copied(torch.from_numpy(chunks))]
+            if change is not None:
+                action += copied(change)
             others = {name: copied(tensor) for name, tensor in others.items()}
             ready = torch.cuda.Event()
             ready.record(self._stream)

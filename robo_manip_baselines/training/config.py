@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar
 
 import tyro
 
+from robo_manip_baselines.data.actions import ActionEncoding
 from robo_manip_baselines.data.normalization import METHODS
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
@@ -43,6 +44,9 @@ RUNTIME_OPTIONS = frozenset(
 
 BUDGET_OPTIONS = frozenset({"steps", "epochs"})
 """Options that may also change when a run is resumed, to extend it."""
+
+EXTENDING_OPTIONS = BUDGET_OPTIONS | {"early_stopping"}
+"""The same, with what ends a run before its budget is spent."""
 
 _PARTS = ("network", "training", "spec")
 """Attributes of the configuration whose fields are options."""
@@ -105,6 +109,8 @@ class TrainConfig(Generic[Network]):
         require_choice("preset", self.preset, ["auto", *policy_presets(self.policy)])
         task_entry(self.env).require_arms(self.spec.arms)
         require_ranges(self)
+        if self.training.relative_actions and self.spec.moves_gripper:
+            ActionEncoding(self.spec, 1.0, is_relative=True)  # refuses
         if self.training.norm is not None:
             own = policy_entry(self.policy).normalization
             require_choice("norm", self.training.norm, dict.fromkeys([*METHODS, own]))
@@ -257,7 +263,7 @@ def require_same_config(
         if name not in may_differ and value != before.get(name):
             pair = before[name], value
             old, new = (" ".join(map(str, v)) if isinstance(v, list) else v for v in pair)
-            extends = "--resume extends it, " if name in BUDGET_OPTIONS else ""
+            extends = "--resume extends it, " if name in EXTENDING_OPTIONS else ""
             raise RequestError(
                 f"'{run}' holds a run with {name} {old}, not {new}; "
                 f"{extends}choose another --out, or give the same options"

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from robo_manip_baselines.data.actions import ActionEncoding
 from robo_manip_baselines.data.demonstrations import (
     Demonstrations,
     Split,
@@ -38,10 +41,10 @@ from robo_manip_baselines.runs.metrics import (
 )
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.runs.versions import software_versions
-from robo_manip_baselines.training.batching import ExampleSampler
+from robo_manip_baselines.training.batching import ExampleSampler, chunk_rows
 from robo_manip_baselines.training.config import (
-    BUDGET_OPTIONS,
     CONFIG,
+    EXTENDING_OPTIONS,
     METRICS,
     RUNTIME_OPTIONS,
     TrainConfig,
@@ -60,6 +63,7 @@ class TrainSetup:
         demonstrations: all episodes.
         split: training episodes and episodes held out.
         normalization: measured on the training episodes.
+        encoding: of the actions.
         sampler: of the examples of each step.
         total_steps: the budget.
     """
@@ -68,6 +72,7 @@ class TrainSetup:
     demonstrations: Demonstrations
     split: Split
     normalization: Normalization
+    encoding: ActionEncoding
     sampler: ExampleSampler
     total_steps: int
 
@@ -85,16 +90,18 @@ class TrainSetup:
             raise RequestError(f"'{folder}' holds {given.env_id}, not {env_id}")
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = list(given.indices(split.train))
-        rows = given.rows(train)
+        step = settings.skip * given.control_period
+        encoding = ActionEncoding(given.spec, step, settings.relative_actions)
         if config.init_from is None:
             normalize = METHODS.get(config.norm) or load_part(config.norm)
-            normalization = normalize(given.state[rows], given.action[rows])
+            actions = _encoded_actions(config, given, encoding, train)
+            normalization = normalize(given.state[given.rows(train)], actions)
         else:
             normalization = _initial(config, given).normalization
         lengths = given.lengths[train]
         sampler = ExampleSampler(lengths, settings.sampler, settings.batch_size, seed)
         total = sampler.total_steps(settings)
-        setup = cls(config, given, split, normalization, sampler, total)
+        setup = cls(config, given, split, normalization, encoding, sampler, total)
         network = without_initial_weights(config.network)
         require_memory(config.policy, network, setup.dims, copies=4)
         return setup
@@ -126,8 +133,9 @@ class TrainSetup:
         """Raise RequestError where the network cannot return the actions of the demonstrations."""
         if model.action_range is None:
             return
-        rows = self.demonstrations.rows(self.demonstrations.indices(self.split.train))
-        action = self.normalization.normalize_action(self.demonstrations.action[rows])
+        train = self.demonstrations.indices(self.split.train)
+        encoded = _encoded_actions(self.config, self.demonstrations, self.encoding, train)
+        action = self.normalization.normalize_action(encoded)
         if (largest := float(np.abs(action).max())) > model.action_range * (1 + 1e-4):
             raise RequestError(
                 f"norm {self.config.norm}: actions of the demonstrations reach {largest:.3g} and "
@@ -173,7 +181,7 @@ class TrainSetup:
         run = self.config.folder
         if not list_checkpoints(run):
             return None
-        extendable = RUNTIME_OPTIONS | BUDGET_OPTIONS
+        extendable = RUNTIME_OPTIONS | EXTENDING_OPTIONS
         require_same_config(run, self.config, extendable if resume else RUNTIME_OPTIONS)
         checkpoint = read_checkpoint(run)
         if resume and checkpoint.step > self.total_steps:
@@ -254,3 +262,34 @@ def _initial(config: TrainConfig[Any], given: Demonstrations) -> Checkpoint:
         if there != here:
             raise RequestError(f"init_from '{config.init_from}': {name} {there}, not {here}")
     return initial
+
+
+def _encoded_actions(
+    config: TrainConfig[Any],
+    given: Demonstrations,
+    encoding: ActionEncoding,
+    episodes: Sequence[int],
+) -> NDArray[np.float32]:
+    """Return the actions of some episodes as a policy is to predict them, (n, A).
+
+    Relative to what is observed when a chunk begins, each is there once for each of its places in a
+    chunk. A policy whose settings have no ``chunk_size`` is taken to predict one action.
+
+    Raises:
+        RequestError: they cannot be encoded.
+    """
+    rows = given.rows(episodes)
+    if not encoding:
+        return given.action[rows]
+    encoding.require_round_trip(given.action[rows])
+    columns, lengths = encoding.columns(given.action), given.lengths[list(episodes)]
+    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)])
+    numbers = np.repeat(np.arange(len(lengths)), lengths)
+    starts = np.arange(len(rows)) - offsets[numbers]
+    size = getattr(config.network, "chunk_size", 1)
+    chunks, _ = chunk_rows(offsets, numbers, starts, size, config.training.skip)
+    encoded = np.empty((size, *given.action[rows].shape), np.float32)
+    reference = encoding.reference(given.state[rows], size)
+    for place in range(size):
+        encoded[place] = columns[rows[chunks[:, place]]] - reference[:, place]
+    return encoded.reshape(-1, encoded.shape[-1])

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,7 +16,13 @@ from torch.nn.parallel import DistributedDataParallel
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
-from robo_manip_baselines.runs.checkpoints import prune_checkpoints, step_folder
+from robo_manip_baselines.runs.checkpoints import (
+    BEST,
+    prune_checkpoints,
+    remove_later_checkpoints,
+    remove_partial_checkpoints,
+    step_folder,
+)
 from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import pip_install
@@ -87,9 +94,13 @@ def _train(
         if processes.is_main:
             stack.enter_context(locked(config.folder))
         start = setup.find_start(resume)
+        before = EarlyStopping.of_run(config, start.step if start else 0)
         if start and start.step >= setup.total_steps:
             done = config.folder, start.step
             logger.info("%s is finished: %d steps; a larger --steps extends it", *done)
+        elif start and before.is_over:
+            done = config.folder, start.step, before
+            logger.info("%s is finished: %d steps, %s; --early_stopping 0 extends it", *done)
         else:
             processes.wait()  # until every process has seen the folder as it was
             log = stack.enter_context(setup.open_log(start)) if processes.is_main else None
@@ -98,7 +109,7 @@ def _train(
                 images = stack.enter_context(ImageStore(setup.demonstrations))
             trainer = Trainer(setup, start, device, processes, images=images, log=log)
             stop = stack.enter_context(StopRequest(once_more=processes.world_size == 1))
-            if trainer.run(stop) < setup.total_steps:
+            if trainer.run(stop) < setup.total_steps and not trainer.ended_early:
                 return EXIT_INTERRUPTED
         if processes.is_main:
             run = config.folder
@@ -107,6 +118,55 @@ def _train(
             else:
                 logger.info("no image of the curves; run: %s", pip_install("matplotlib"))
     return 0
+
+
+class EarlyStopping:
+    """End of a training after a number of validations without a smaller loss.
+
+    Args:
+        patience: that number; 0 never ends it.
+
+    Attributes:
+        best: smallest loss so far.
+        best_step: steps that had been done then.
+        waited: validations since.
+    """
+
+    def __init__(self, patience: int) -> None:
+        self._patience = patience
+        self.best, self.best_step, self.waited = math.inf, 0, 0
+
+    @classmethod
+    def of_run(cls, config: TrainConfig[Any], step: int) -> EarlyStopping:
+        """Return what the validations of a run's first steps, up to ``step``, have led to."""
+        state = cls(config.training.early_stopping)
+        for line in read_metrics(config.folder / METRICS) if state._patience and step else ():
+            if line["kind"] == "validation" and line["step"] <= step and "loss" in line:
+                state.add(line["step"], line["loss"])
+        return state
+
+    def add(self, step: int, loss: float) -> bool:
+        """Include a validation; return whether its loss is the smallest."""
+        if loss < self.best:
+            self.best, self.best_step, self.waited = loss, step, 0
+            return True
+        self.waited += 1
+        return False
+
+    @property
+    def is_over(self) -> bool:
+        """True if the training ends here."""
+        return 0 < self._patience <= self.waited
+
+    def __bool__(self) -> bool:
+        """Return whether the training may end early."""
+        return self._patience > 0
+
+    def __str__(self) -> str:
+        return (
+            f"{self.waited} validations after the smallest held-out loss, {self.best:.4g} at step "
+            f"{self.best_step}"
+        )
 
 
 class Trainer:
@@ -125,6 +185,7 @@ class Trainer:
         loader: of the training batches.
         held_out: loss on the episodes held out; None without any, and in all processes but the
             first.
+        ended_early: whether `run` ended by early stopping.
 
     Raises:
         RequestError: the network cannot be built, the device lacks the precision, or the
@@ -148,6 +209,10 @@ class Trainer:
         self.state = TrainerState(model, settings)
         seconds = self.state.restore(start) if start else 0.0
         self._saved_step = start.step if start else 0
+        self._early, self.ended_early = EarlyStopping.of_run(config, self._saved_step), False
+        if processes.is_main and self._early:
+            remove_partial_checkpoints(config.folder / BEST)
+            remove_later_checkpoints(config.folder / BEST, self._saved_step)
         done = setup.total_steps, self._saved_step, seconds
         self._progress = StepProgress(*done, shown=processes.is_main)
         self._timer = StepTimer(device)
@@ -171,7 +236,10 @@ class Trainer:
             device=device,
             rank=processes.rank,
             world_size=processes.world_size,
+            encoding=setup.encoding,
+            skip=settings.skip,
             state_noise=noise,
+            action_noise=settings.action_noise,
             images=images,
         )
         self.held_out: HeldOutLoss | None = None
@@ -208,8 +276,9 @@ class Trainer:
                 is_stopping = self._is_stopping(stop)
                 if progress.is_due(config.log_every):
                     progress.report(self._log_losses())
-                if self.held_out and progress.is_due(config.validate_every):
-                    self._write("validation", self.held_out(self.state.evaluated))
+                if progress.is_due(config.validate_every):
+                    self._validate()
+                    is_stopping |= self.ended_early
                 if progress.is_due(config.checkpoint_every) or is_stopping:
                     self._save()
                 if is_stopping:
@@ -223,6 +292,18 @@ class Trainer:
         if waits and self._progress.step % _STEPS_BETWEEN_VOTES:
             return False
         return self._processes.any(stop.is_made, self._device)
+
+    def _validate(self) -> None:
+        """Write the loss on the episodes held out, keep the best checkpoint, and perhaps end."""
+        if self.held_out:
+            losses = self.held_out(self.state.evaluated)
+            self._write("validation", losses)
+            if self._early and self._early.add(self._progress.step, losses["loss"]):
+                self._write_checkpoint(self._setup.config.folder / BEST, kept=1)
+        if self._early and self._processes.any(self._early.is_over, self._device):
+            self.ended_early = True
+            if self._processes.is_main:
+                logger.info("stopped early: %s", self._early)
 
     def _log_losses(self) -> float:
         """Write the mean losses since the last line; return the loss."""
@@ -252,12 +333,16 @@ class Trainer:
             flags.append(self.state.losses.sums.isfinite().all())
         self._require_finite(bool(torch.stack(flags).all()))
         if self._processes.is_main:
-            run, step = self._setup.config.folder, self._progress.step
-            tensors, json = self.state.state_dict(step, self._progress.seconds)
-            checkpoint = self._setup.checkpoint(step)
-            write_checkpoint(step_folder(run, step), checkpoint, weights, tensors, json)
-            self._saved_step = step
-            prune_checkpoints(run, KEPT_CHECKPOINTS)
+            self._write_checkpoint(self._setup.config.folder, KEPT_CHECKPOINTS)
+            self._saved_step = self._progress.step
+
+    def _write_checkpoint(self, run: Path, kept: int) -> None:
+        """Write a checkpoint into a run folder, and remove all but the newest."""
+        step, weights = self._progress.step, self.state.evaluated.state_dict()
+        tensors, json = self.state.state_dict(step, self._progress.seconds)
+        checkpoint = self._setup.checkpoint(step)
+        write_checkpoint(step_folder(run, step), checkpoint, weights, tensors, json)
+        prune_checkpoints(run, kept)
 
     def _require_finite(self, is_finite: bool) -> None:
         if self._processes.any(not is_finite, self._device):
@@ -322,7 +407,8 @@ class HeldOutLoss:
         episodes = given.indices(setup.split.validation)
         sampler = ExampleSampler(given.lengths[list(episodes)], "episode", batch_size, seed)
         data = given, setup.normalization, episodes, sampler, model
-        self._loader = BatchLoader(*data, seed=seed, device=device, images=images)
+        coding: Any = {"encoding": setup.encoding, "skip": setup.config.training.skip}
+        self._loader = BatchLoader(*data, seed=seed, device=device, images=images, **coding)
         self._steps = -(-HELD_OUT_STARTS * len(episodes) // batch_size)
         self._device, self._autocast = device, autocast
 

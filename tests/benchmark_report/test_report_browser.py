@@ -1,13 +1,10 @@
 """The report in headless Chromium: it draws, sorts, plays, and every number opens its rows.
 
-Needs Playwright and a Chromium that plays H.264, as Debian's does: ``apt-get install chromium``.
-``RMB_CHROMIUM`` names another one.
+Needs a Chromium that plays H.264, as Debian's does.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,22 +28,8 @@ from robo_manip_baselines.rollout.videos import VideoWriter
 
 pytestmark = pytest.mark.long
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-FLAGS = (
-    # As root, and in containers, there is no sandbox; the page is ours.
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-)
 PATIENCE = 30_000
 """ms; a busy machine is slow, a broken page never gets there."""
-
-
-def chromium() -> str:
-    """The browser, or a skip that says how to get one."""
-    found = os.environ.get("RMB_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
-    if found is None:
-        pytest.skip("no Chromium: apt-get install chromium, or name one in $RMB_CHROMIUM")
-    return found
 
 
 def write_video(path: Path) -> Path:
@@ -97,27 +80,25 @@ class Opened:
 
 @pytest.fixture(scope="module")
 def opened(
-    tmp_path_factory: pytest.TempPathFactory, make_rows: Callable[..., tuple[ResultRow, ...]]
+    tmp_path_factory: pytest.TempPathFactory,
+    make_rows: Callable[..., tuple[ResultRow, ...]],
+    browser: Any,
 ) -> Iterator[Opened]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-    executable = chromium()
     names = ("baseline", "current", "current_pred_h2", "current_pred_h2_uniform")
     statistics = analyze(make_rows(conditions=names, episodes=30), task=TASK, resamples=100)
     path = tmp_path_factory.mktemp("report") / "report.html"
     video = write_video(path.with_name("video.mp4"))
     shown = [read_video(video, row) for row in episodes_to_show(statistics)]
     write_report(path, make_report(statistics, title="Feeding", videos=shown))
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=executable, args=list(FLAGS))
-        page = browser.new_page(viewport={"width": 1280, "height": 900})
-        page.set_default_timeout(PATIENCE)
-        found = Opened(page, statistics, path.as_uri())
-        page.on("console", lambda message: found.messages.append(message.text))
-        page.on("pageerror", lambda error: found.messages.append(str(error)))
-        page.on("request", lambda request: found.requests.append(request.url))
-        page.goto(found.address)
-        yield found
-        browser.close()
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(PATIENCE)
+    found = Opened(page, statistics, path.as_uri())
+    page.on("console", lambda message: found.messages.append(message.text))
+    page.on("pageerror", lambda error: found.messages.append(str(error)))
+    page.on("request", lambda request: found.requests.append(request.url))
+    page.goto(found.address)
+    yield found
+    page.close()
     assert found.messages == []
 
 

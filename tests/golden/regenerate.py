@@ -27,12 +27,15 @@ from robo_manip_baselines.policy.flow.model import FlowModel
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel
 from robo_manip_baselines.policy.mlp.config import MlpConfig
 from robo_manip_baselines.policy.mlp.model import MlpModel
+from robo_manip_baselines.policy.sarnn.config import SarnnConfig
+from robo_manip_baselines.policy.sarnn.model import SarnnModel
 from robo_manip_baselines.runs.files import write_json
 
 ACT_STEP = Path(__file__).with_name("act_step.json")
 DENOISING_STEP = Path(__file__).with_name("denoising_step.json")
 FACE_STEP = Path(__file__).with_name("face_step.json")
 MLP_STEP = Path(__file__).with_name("mlp_step.json")
+SARNN_STEP = Path(__file__).with_name("sarnn_step.json")
 
 DIMS = PolicyDims(state=14, action=7, cameras=2, image=(48, 72))
 CONFIG = {
@@ -110,6 +113,17 @@ def mlp_step() -> dict[str, Any]:
     model = MlpModel(config, replace(DIMS, cameras=0))
     watched = ("layers.0.weight", "layers.1.bias", "layers.3.weight", "layers.7.weight")
     return training_step(model, fixed_batch(has_images=False), watched)
+
+
+def sarnn_step() -> dict[str, Any]:
+    """Return `training_step` of the recurrent policy, with images."""
+    model = SarnnModel(SarnnConfig(chunk_size=8, n_obs_steps=3, hidden_size=16), DIMS)
+    batch = fixed_batch(has_images=True)
+    assert batch.images is not None
+    images = batch.images.repeat(1, 3, 1, 1, 1, 1)
+    batch = replace(batch, state=fill((3, 3, 14), 1, 1.5), images=images)
+    watched = tuple(n for n, _ in model.named_parameters() if "weight" in n)
+    return training_step(model, batch, watched)
 
 
 DENOISING_STEPS = (
@@ -228,6 +242,7 @@ def main() -> None:
     }
     write_json(ACT_STEP, golden)
     write_json(MLP_STEP, mlp_step())
+    write_json(SARNN_STEP, sarnn_step())
     write_json(DENOISING_STEP, {f"{p} {b}": denoising_step(p, b) for p, b in DENOISING_STEPS})
 
 

@@ -26,11 +26,12 @@ def numbers(tree: dict[str, Any], prefix: str = "") -> dict[str, float]:
     return flat
 
 
-@pytest.mark.parametrize("step", ["default", "paper_compat", "mlp"])
+@pytest.mark.parametrize("step", ["default", "paper_compat", "mlp", "sarnn"])
 def test_a_training_step(repository: Path, step: str) -> None:
     golden = runpy.run_path(str(repository / "tests" / "golden" / "regenerate.py"))
-    if step == "mlp":
-        expected, found = json.loads(golden["MLP_STEP"].read_text()), golden["mlp_step"]()
+    if step in ("mlp", "sarnn"):
+        file = golden[f"{step.upper()}_STEP"]
+        expected, found = json.loads(file.read_text()), golden[f"{step}_step"]()
     else:
         expected = json.loads(golden["ACT_STEP"].read_text())[step]
         found = golden["act_step"](paper_compat=step == "paper_compat")

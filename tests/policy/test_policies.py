@@ -67,7 +67,7 @@ def test_presets_make_networks_that_fit(policy: str) -> None:
             model = make_model(policy, preset.config, dims_of(policy, name))
         assert isinstance(model, PolicyModel)
         assert min(model.chunk_size, model.n_obs_steps) >= 1
-        assert preset.execution.n_action_steps <= model.chunk_size
+        assert preset.execution.n_action_steps <= model.chunk_size * preset.training.skip
 
 
 @every_policy

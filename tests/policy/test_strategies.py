@@ -21,7 +21,6 @@ from robo_manip_baselines.policy.execution import (
     ActionQueue,
     PolicyRunner,
     make_action_buffer,
-    posture_places,
     soft_weights,
 )
 from robo_manip_baselines.policy.flow.config import FlowConfig
@@ -157,7 +156,7 @@ def test_a_chunk_under_way() -> None:
 
 SPEC = ObservationSpec(obs="current", cameras=())
 SIZE = len(SPEC.vector_names(ObservedNames()))
-POSTURE = posture_places(SPEC)
+POSTURE = SPEC.posture_places
 
 
 def normalization() -> Normalization:

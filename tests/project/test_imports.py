@@ -29,6 +29,7 @@ OF_TORCH = (
     "robo_manip_baselines.policy.flow",
     "robo_manip_baselines.policy.interface",
     "robo_manip_baselines.policy.mlp",
+    "robo_manip_baselines.policy.sarnn",
     "robo_manip_baselines.training",
 )
 

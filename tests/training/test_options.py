@@ -264,7 +264,10 @@ def test_run_folders(line: str, folder: str) -> None:
         ("", ["name the policy to train first", "Act, Mlp"]),
         ("--preset cpu Act", ["name the policy to train first"]),
         ("act", ["unknown policy 'act'", "mean 'Act'"]),
-        ("Act --preset papre", ["unknown preset 'papre'", "mean 'paper'", "valid: cpu, paper"]),
+        (
+            "Act --preset papre",
+            ["unknown preset 'papre'", "mean 'paper'", "cpu, cpu_images, paper"],
+        ),
         ("Act --chunk_siez 3", ["'--chunk_siez'", "mean '--chunk_size'"]),
         ("Mlp --kl_weight 3", ["unknown option '--kl_weight'"]),
         ("Act --batch_size x", ["--batch_size is a whole number, not 'x'"]),

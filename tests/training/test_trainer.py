@@ -20,7 +20,7 @@ from robo_manip_baselines.policy.act import resnet as backbone
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
 from robo_manip_baselines.policy.interface import Batch
 from robo_manip_baselines.policy.mlp.model import MlpModel
-from robo_manip_baselines.runs.checkpoints import list_checkpoints
+from robo_manip_baselines.runs.checkpoints import BEST, list_checkpoints
 from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import read_metrics
@@ -29,7 +29,7 @@ from robo_manip_baselines.training.config import CONFIG, METRICS, TrainConfig, r
 from robo_manip_baselines.training.device import Processes
 from robo_manip_baselines.training.images import ImageStore
 from robo_manip_baselines.training.setup import TrainSetup
-from robo_manip_baselines.training.trainer import Trainer, train
+from robo_manip_baselines.training.trainer import HeldOutLoss, Trainer, train
 
 pytestmark = pytest.mark.long
 
@@ -409,3 +409,44 @@ def test_what_another_training_cannot_begin_with(
     run(FLOW, episodes, tmp_path / "first")
     with pytest.raises(RequestError, match=message):
         make_trainer(f"{FLOW} {more} --init_from {tmp_path}/first", episodes, tmp_path / "second")
+
+
+def test_a_training_ends_where_the_held_out_loss_stops_falling(
+    episodes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Weights that do not move: the first validation is the best one."""
+    still = f"{PLAIN} --schedule constant --learning_rate 1e-30 --validate_every 2"
+    early = f"{still} --early_stopping 2"
+    for out, stop_at in (("whole", None), ("parts", 5)):
+        if stop_at:
+            assert run(early, episodes, tmp_path / out, stop_at=stop_at) == stop_at
+        assert run(early, episodes, tmp_path / out) == 6  # 2, and two more validations
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    ((step, _),) = list_checkpoints(tmp_path / "whole" / BEST)
+    assert step == read_checkpoint(tmp_path / "whole" / BEST).step == 2
+    assert read_checkpoint(tmp_path / "whole").step == 6
+    caplog.set_level("INFO")
+    assert run(early, episodes, tmp_path / "whole") == 6
+    assert "2 validations after the smallest held-out loss" in caplog.text
+    # Extended, it is the run that never stopped.
+    assert run(f"{still} --early_stopping 0", episodes, tmp_path / "whole") == STEPS
+    run(still, episodes, tmp_path / "never")
+    assert contents(tmp_path / "whole")["model"] == contents(tmp_path / "never")["model"]
+
+
+def test_a_loss_that_falls_is_followed(episodes: Path, tmp_path: Path) -> None:
+    line = f"{PLAIN} --schedule constant --learning_rate 0.01 --validate_every 1 --early_stopping 9"
+    run(line, episodes, tmp_path)
+    losses = [x for x in read_metrics(tmp_path / METRICS) if x["kind"] == "validation"]
+    best = min(losses, key=lambda x: x["loss"])
+    checkpoint = read_checkpoint(tmp_path / BEST)
+    assert checkpoint.step == best["step"]
+    setup = TrainSetup.load(configure(line, episodes, tmp_path / "again"))
+    model = load_model(checkpoint)
+    held_out = HeldOutLoss(setup, model, None, CPU, None)
+    assert held_out(model)["loss"] == pytest.approx(best["loss"], rel=1e-6)  # float32
+
+
+def test_early_stopping_needs_episodes_to_stop_by(episodes: Path, tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="no episodes are held out to stop by"):
+        configure(f"{MLP} --validation_fraction 0 --early_stopping 3", episodes, tmp_path)

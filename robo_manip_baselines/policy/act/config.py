@@ -107,6 +107,20 @@ class ActConfig:
         return count + width * (self.num_queries + ends)
 
 
+_SMALL = ActConfig(
+    chunk_size=30,
+    hidden_size=128,
+    feedforward_size=256,
+    num_heads=4,
+    encoder_layers=1,
+    decoder_layers=1,
+    actions_per_query=5,
+    state_layers=2,
+    use_cvae=False,
+    dropout=0.0,
+)
+"""Sizes in the presets for a processor without a GPU."""
+
 PRESETS = {
     "paper": PolicyPreset(
         config=ActConfig(),
@@ -114,21 +128,17 @@ PRESETS = {
         execution=ActionExecution(),
     ),
     "cpu": PolicyPreset(
-        config=ActConfig(
-            chunk_size=30,
-            hidden_size=128,
-            feedforward_size=256,
-            num_heads=4,
-            encoder_layers=1,
-            decoder_layers=1,
-            actions_per_query=5,
-            state_layers=2,
-            use_cvae=False,
-            dropout=0.0,
-        ),
+        config=_SMALL,
         training=replace(STATE_ONLY_TRAINING, steps=3000),
         execution=ActionExecution(),
         cameras=(),
         object_pose=True,
+    ),
+    "cpu_images": PolicyPreset(
+        config=_SMALL,
+        training=replace(STATE_ONLY_TRAINING, batch_size=16, steps=3000),
+        execution=ActionExecution(temporal_ensemble=False, n_action_steps=8),
+        cameras=("angle", "front_close"),
+        image_size=(60, 80),
     ),
 }

@@ -1,16 +1,19 @@
-"""Settings of the network that Diffusion and Flow share. Importing this needs no PyTorch."""
+"""Settings and presets that Diffusion and Flow share. Importing this needs no PyTorch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from annotated_types import Interval
 
 from robo_manip_baselines.policy.presets import (
+    STATE_ONLY_TRAINING,
+    ActionExecution,
     Chunk,
     Layers,
     PolicyDims,
+    PolicyPreset,
     TrainSettings,
     Width,
 )
@@ -49,6 +52,8 @@ class DenoisingConfig:
         vision: encoder of the images, one for all cameras: resnet18, or small, four convolutions.
         keypoints: points in each image whose coordinates describe it: the spatial softmax of Chi
             et al. (32).
+        max_guidance: largest weight of the guidance with --strategy rtc (Black et al. 2025, arXiv
+            2506.07339: 5).
 
     Raises:
         RequestError: a value that is not valid.
@@ -66,6 +71,7 @@ class DenoisingConfig:
     dropout: Fraction = 0.0
     vision: Literal["resnet18", "small"] = "resnet18"
     keypoints: Annotated[int, Interval(ge=1, le=4096)] = 32
+    max_guidance: Annotated[float, Interval(ge=0.0, le=1e6)] = 5.0
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -106,7 +112,7 @@ def _require_multiple(name: str, value: int, divisor: int, why: str) -> None:
         raise RequestError(f"{name} {value}: must be a multiple of {why}")
 
 
-SMALL: dict[str, Any] = {
+_SMALL: dict[str, Any] = {
     "chunk_size": 32,
     "channels": (48, 96),
     "hidden_size": 128,
@@ -116,7 +122,7 @@ SMALL: dict[str, Any] = {
 }
 """Sizes in the presets for a processor without a GPU."""
 
-PAPER_TRAINING = TrainSettings(
+_PAPER_TRAINING = TrainSettings(
     batch_size=16,
     learning_rate=1e-4,
     weight_decay=1e-6,
@@ -129,3 +135,37 @@ PAPER_TRAINING = TrainSettings(
 )
 """Training of the public Diffusion Policy with images of real robots, its configuration
 ``train_diffusion_unet_real_image_workspace``; but for AdamW's first beta, 0.95 there."""
+
+Config = TypeVar("Config", bound=DenoisingConfig)
+
+
+def denoising_presets(
+    kind: type[Config], *, paper: dict[str, Any] | None = None, cpu: dict[str, Any] | None = None
+) -> dict[str, PolicyPreset]:
+    """Return the presets of a policy whose settings are of this kind.
+
+    ``paper`` and ``cpu`` are settings of these presets that only this policy has.
+    """
+    execution = ActionExecution(temporal_ensemble=False, n_action_steps=8)
+    return {
+        "paper": PolicyPreset(
+            config=kind(chunk_size=64, channels=(512, 1024, 2048), **(paper or {})),
+            training=_PAPER_TRAINING,
+            execution=ActionExecution(temporal_ensemble=False, n_action_steps=16),
+            image_size=(96, 128),
+        ),
+        "cpu": PolicyPreset(
+            config=kind(**_SMALL, backbone="perceptron", **(cpu or {})),
+            training=STATE_ONLY_TRAINING,
+            execution=execution,
+            cameras=(),
+            object_pose=True,
+        ),
+        "cpu_images": PolicyPreset(
+            config=kind(**_SMALL),
+            training=STATE_ONLY_TRAINING,
+            execution=execution,
+            cameras=("angle", "front_close"),
+            image_size=(60, 80),
+        ),
+    }

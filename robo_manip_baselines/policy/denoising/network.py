@@ -180,9 +180,9 @@ class ImageEncoder(nn.Module):
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, config: DenoisingConfig) -> None:
+    def __init__(self, vision: str, keypoints: int) -> None:
         super().__init__()
-        self.is_small = config.vision == "small"
+        self.is_small = vision == "small"
         if self.is_small:
             layers: list[nn.Module] = []
             for width_in, width in zip((3, *SMALL_VISION[:-1]), SMALL_VISION, strict=True):
@@ -193,7 +193,7 @@ class ImageEncoder(nn.Module):
         else:
             self.convolutions = ResNet18()
             width = self.convolutions.features
-        self.maps = nn.Conv2d(width, config.keypoints, 1)
+        self.maps = nn.Conv2d(width, keypoints, 1)
         self.register_buffer("mean", 255.0 * torch.tensor(MEAN).view(3, 1, 1), persistent=False)
         scale = 1.0 / (255.0 * torch.tensor(STD).view(3, 1, 1))
         self.register_buffer("scale", scale, persistent=False)
@@ -215,9 +215,9 @@ def keypoints(maps: Tensor) -> Tensor:
 
 
 class DenoisingModel(PolicyModel):
-    """Network that tells, for noisy actions of a known noise level, the noise or the actions.
+    """Policy whose network tells, for noisy actions of a known level, the noise or the actions.
 
-    Initial weights are drawn from PyTorch's default generator.
+    A policy adds a `loss` and a `sample`. Initial weights come from PyTorch's default generator.
 
     Args:
         config: of the network.
@@ -230,9 +230,10 @@ class DenoisingModel(PolicyModel):
     ) -> None:
         super().__init__()
         self.chunk_size, self.n_obs_steps = config.chunk_size, config.n_obs_steps
-        self.action_size = dims.action
+        self.action_size, self.max_guidance = dims.action, config.max_guidance
+        self.strategies = ("rtc",)
         width = config.hidden_size
-        self.vision = ImageEncoder(config) if dims.cameras else None
+        self.vision = ImageEncoder(config.vision, config.keypoints) if dims.cameras else None
         features = dims.state + dims.cameras * 2 * config.keypoints
         self.observation = nn.Sequential(
             nn.Linear(config.n_obs_steps * features, 2 * width),
@@ -247,6 +248,34 @@ class DenoisingModel(PolicyModel):
         self.network = NETWORKS[config.backbone](config, dims.action + marks_prefix, dims.action)
         self.marks_prefix = marks_prefix
         self.finds_action = config.target == "action"
+
+    def sample(
+        self,
+        observed: Tensor,
+        noise: Tensor | None,
+        action: Tensor | None = None,
+        weight: Tensor | None = None,
+    ) -> Tensor:
+        """Return a chunk (B, K, A), for an embedded observation, from noise (B, Z).
+
+        With a weight (B, K) it is guided towards ``action`` (B, K, A).
+        """
+        raise NotImplementedError
+
+    def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
+        """Return normalised actions (B, K, A)."""
+        return self.sample(self.observe(state, images), noise)
+
+    def inpaint(
+        self,
+        state: Tensor,
+        images: Tensor | None,
+        noise: Tensor | None,
+        action: Tensor,
+        weight: Tensor,
+    ) -> Tensor:
+        """Return a chunk that is guided towards ``action``: real-time chunking."""
+        return self.sample(self.observe(state, images), noise, action, weight)
 
     def observe(self, state: Tensor, images: Tensor | None) -> Tensor:
         """Return the embedded observation (B, D) of (B, O, S) and (B, O, N, H, W, 3)."""

@@ -7,16 +7,8 @@ from typing import Annotated
 
 from annotated_types import Interval
 
-from robo_manip_baselines.policy.denoising.config import (
-    PAPER_TRAINING,
-    SMALL,
-    DenoisingConfig,
-)
-from robo_manip_baselines.policy.presets import (
-    STATE_ONLY_TRAINING,
-    ActionExecution,
-    PolicyPreset,
-)
+from robo_manip_baselines.policy.denoising.config import DenoisingConfig, denoising_presets
+from robo_manip_baselines.policy.presets import PolicyPreset
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.ranges import Amount
 
@@ -32,8 +24,6 @@ class DiffusionConfig(DenoisingConfig):
             al. 2021), 1 with all levels is DDPM (Ho et al. 2020).
         clip_sample: largest absolute normalised action of a prediction (Chi et al.: 1, the range of
             the demonstrations); 0 for none.
-        max_guidance: largest weight of the guidance with --strategy rtc (Black et al. 2025, arXiv
-            2506.07339: 5).
 
     Raises:
         RequestError: a value that is not valid.
@@ -43,7 +33,6 @@ class DiffusionConfig(DenoisingConfig):
     sampling_steps: Annotated[int, Interval(ge=1, le=10_000)] = 10
     eta: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.0
     clip_sample: Amount = 1.0
-    max_guidance: Annotated[float, Interval(ge=0.0, le=1e6)] = 5.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -54,27 +43,4 @@ class DiffusionConfig(DenoisingConfig):
             )
 
 
-_EXECUTION = ActionExecution(temporal_ensemble=False, n_action_steps=8)
-
-PRESETS = {
-    "paper": PolicyPreset(
-        config=DiffusionConfig(chunk_size=64, channels=(512, 1024, 2048)),
-        training=PAPER_TRAINING,
-        execution=ActionExecution(temporal_ensemble=False, n_action_steps=16),
-        image_size=(96, 128),
-    ),
-    "cpu": PolicyPreset(
-        config=DiffusionConfig(**SMALL, backbone="perceptron"),
-        training=STATE_ONLY_TRAINING,
-        execution=_EXECUTION,
-        cameras=(),
-        object_pose=True,
-    ),
-    "cpu_images": PolicyPreset(
-        config=DiffusionConfig(**SMALL),
-        training=STATE_ONLY_TRAINING,
-        execution=_EXECUTION,
-        cameras=("angle", "front_close"),
-        image_size=(60, 80),
-    ),
-}
+PRESETS: dict[str, PolicyPreset] = denoising_presets(DiffusionConfig)

@@ -53,7 +53,6 @@ class DiffusionModel(DenoisingModel):
         size = config.chunk_size * dims.action
         self.noise_size = size + 1  # and one for the level
         self.sample_noise_size = size * (1 + (config.sampling_steps - 1) * (config.eta > 0.0))
-        self.strategies = ("rtc",)
         self.action_range = config.clip_sample or None
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
@@ -68,24 +67,14 @@ class DiffusionModel(DenoisingModel):
         wanted = action if self.finds_action else noise
         return {"loss": squared_error(found, wanted, batch.num_examples)}
 
-    def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
-        """Return normalised actions (B, K, A)."""
-        return self._sample(self.observe(state, images), noise, None, None)
-
-    def inpaint(
+    def sample(
         self,
-        state: Tensor,
-        images: Tensor | None,
+        observed: Tensor,
         noise: Tensor | None,
-        action: Tensor,
-        weight: Tensor,
+        action: Tensor | None = None,
+        weight: Tensor | None = None,
     ) -> Tensor:
-        """Return a chunk that is guided towards ``action`` (Song et al. 2023, pseudoinverse)."""
-        return self._sample(self.observe(state, images), noise, action, weight)
-
-    def _sample(
-        self, observed: Tensor, noise: Tensor | None, action: Tensor | None, weight: Tensor | None
-    ) -> Tensor:
+        """Return a chunk (B, K, A) from noise (B, Z), guided as in Song et al. 2023."""
         assert noise is not None
         fresh = iter(noise.view(len(observed), -1, self.chunk_size, self.action_size).unbind(1))
         noisy, clip = next(fresh), self.config.clip_sample or math.inf
@@ -103,7 +92,7 @@ class DiffusionModel(DenoisingModel):
                 estimate = clean(noisy)
             else:
                 pull, estimate = guidance(clean, noisy, action, weight)
-                estimate = estimate + min(self.config.max_guidance, 1.0 / root) * pull
+                estimate = estimate + min(self.max_guidance, 1.0 / root) * pull
             estimate = estimate.clamp(-clip, clip)
             found = (noisy - root * estimate) / spread
             # Song et al. 2021 ("DDIM"), eq. 12 and 16.

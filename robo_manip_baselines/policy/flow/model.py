@@ -27,11 +27,11 @@ class FlowModel(DenoisingModel):
     def __init__(self, config: FlowConfig, dims: PolicyDims) -> None:
         super().__init__(config, dims, marks_prefix=config.max_prefix > 0)
         self.sampling_steps, self.max_prefix = config.sampling_steps, config.max_prefix
-        self.max_guidance = config.max_guidance
         size = config.chunk_size * dims.action
         self.sample_noise_size = size
         self.noise_size = size + 1 + self.marks_prefix  # the time, and the length of the prefix
-        self.strategies = ("rtc", "rtc_trained") if self.marks_prefix else ("rtc",)
+        if self.marks_prefix:
+            self.strategies = ("rtc", "rtc_trained")
         self.max_delay = config.max_prefix
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
@@ -54,9 +54,29 @@ class FlowModel(DenoisingModel):
         found = torch.where(is_fixed[..., None], wanted, found)
         return {"loss": squared_error(found, wanted, batch.num_examples)}
 
-    def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
-        """Return normalised actions (B, K, A), carried from noise by Euler steps."""
-        return self._carry(self.observe(state, images), noise, None, None)
+    def sample(
+        self,
+        observed: Tensor,
+        noise: Tensor | None,
+        action: Tensor | None = None,
+        weight: Tensor | None = None,
+        fixed: Tensor | None = None,
+    ) -> Tensor:
+        """Return a chunk (B, K, A), carried from noise by Euler steps.
+
+        Guided as in Black et al. 2025 (2506.07339); ``fixed`` (B, K) steps stay ``action``.
+        """
+        assert noise is not None
+        position = noise.view(len(observed), self.chunk_size, -1)
+        for step in range(self.sampling_steps):
+            time = step / self.sampling_steps
+            position = _kept(position, action, fixed)
+            if action is None or weight is None:
+                velocity = self._velocity(observed, position, time, fixed)
+            else:
+                velocity = self._guided_velocity(observed, position, time, action, weight)
+            position = position + velocity / self.sampling_steps
+        return _kept(position, action, fixed)
 
     def extend(
         self,
@@ -67,51 +87,22 @@ class FlowModel(DenoisingModel):
         weight: Tensor,
     ) -> Tensor:
         """Return a chunk whose steps of weight 1 are those of ``action``, as in training."""
-        return self._carry(self.observe(state, images), noise, action, weight >= 1.0)
+        return self.sample(self.observe(state, images), noise, action, fixed=weight >= 1.0)
 
-    def inpaint(
-        self,
-        state: Tensor,
-        images: Tensor | None,
-        noise: Tensor | None,
-        action: Tensor,
-        weight: Tensor,
+    def _guided_velocity(
+        self, observed: Tensor, position: Tensor, time: float, action: Tensor, weight: Tensor
     ) -> Tensor:
-        """Return a chunk that is guided towards ``action`` (Black et al. 2025, 2506.07339)."""
-        assert noise is not None
-        observed, position = self.observe(state, images), noise.view_as(action)
-        for step in range(self.sampling_steps):
-            time = step / self.sampling_steps
-            left = 1.0 - time
+        left = 1.0 - time
 
-            def ahead(there: Tensor, time: float = time) -> Tensor:
-                return there + (1.0 - time) * self._velocity(observed, there, time, None)
+        def ahead(there: Tensor) -> Tensor:
+            return there + left * self._velocity(observed, there, time, None)
 
-            pull, estimate = guidance(ahead, position, action, weight)
-            velocity = (estimate - position) / left
-            # Eq. 2 and 4 there: r² = (1 - t)² / (t² + (1 - t)²), weight (1 - t) / (t r²).
-            strength = self.max_guidance
-            if time > 0.0:
-                strength = min(strength, (time**2 + left**2) / (time * left))
-            position = position + (velocity + strength * pull) / self.sampling_steps
-        return position
-
-    def _carry(
-        self, observed: Tensor, noise: Tensor | None, action: Tensor | None, fixed: Tensor | None
-    ) -> Tensor:
-        """Follow the velocity from noise to actions; steps that are ``fixed`` stay ``action``."""
-        assert noise is not None
-        position = noise.view(len(observed), self.chunk_size, -1)
-        if self.marks_prefix and fixed is None:
-            fixed = torch.zeros_like(position[..., 0], dtype=torch.bool)
-        for step in range(self.sampling_steps):
-            if action is not None and fixed is not None:
-                position = torch.where(fixed[..., None], action, position)
-            velocity = self._velocity(observed, position, step / self.sampling_steps, fixed)
-            position = position + velocity / self.sampling_steps
-        if action is not None and fixed is not None:
-            position = torch.where(fixed[..., None], action, position)
-        return position
+        pull, estimate = guidance(ahead, position, action, weight)
+        # Eq. 2 and 4 there: r² = (1 - t)² / (t² + (1 - t)²), weight (1 - t) / (t r²).
+        strength = self.max_guidance
+        if time > 0.0:
+            strength = min(strength, (time**2 + left**2) / (time * left))
+        return (estimate - position) / left + strength * pull
 
     def _velocity(
         self, observed: Tensor, position: Tensor, time: float, is_fixed: Tensor | None
@@ -120,3 +111,10 @@ class FlowModel(DenoisingModel):
             is_fixed = torch.zeros_like(position[..., 0], dtype=torch.bool)
         found = self.found(observed, position, torch.full_like(position[:, 0, 0], time), is_fixed)
         return (found - position) / (1.0 - time) if self.finds_action else found
+
+
+def _kept(position: Tensor, action: Tensor | None, fixed: Tensor | None) -> Tensor:
+    """Return (B, K, A) with ``action`` in the steps that are fixed, (B, K)."""
+    if action is None or fixed is None:
+        return position
+    return torch.where(fixed[..., None], action, position)

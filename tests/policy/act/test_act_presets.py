@@ -29,3 +29,10 @@ def test_cpu_sees_no_images() -> None:
     assert preset.training.steps == 3000
     assert preset.cameras == ()
     assert preset.object_pose
+
+
+def test_cpu_images_is_as_small_and_sees_two_cameras() -> None:
+    preset = PRESETS["cpu_images"]
+    assert preset.config == PRESETS["cpu"].config
+    assert (preset.cameras, preset.image_size) == (("angle", "front_close"), (60, 80))
+    assert not preset.object_pose

@@ -165,8 +165,11 @@ class FaceModel:
             Body name -> positions (..., 3) m and orientations (..., 4), world frame. The bust
             (``face/torso``) keeps still, upright, under the mean of all the mouth positions given.
         """
-        mouth = np.asarray(mouth, float)
-        turn = world_from_body(orientation)
+        return self.placed_bodies(mouth, world_from_body(orientation), jaw)
+
+    def placed_bodies(self, mouth: ArrayLike, turn: ArrayLike, jaw: ArrayLike) -> Poses:
+        """Poses as of `body_poses`, given the head's orientation (..., 4) wxyz, world from head."""
+        mouth, turn = np.asarray(mouth, float), np.asarray(turn, float)
         angle = self.jaw_angle(jaw)
         head = mouth - rotate(turn, self.lip_centre(angle))
         torso = np.broadcast_to(mouth.reshape(-1, 3).mean(axis=0), mouth.shape).copy()

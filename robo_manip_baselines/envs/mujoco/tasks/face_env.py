@@ -68,7 +68,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
     ``turn_away`` |
 
     Args:
-        obs, horizon, cameras, image_size, object_pose, arms, relative: see `ObservationSpec`.
+        obs, horizon, cameras, image_size, object_pose, arms, relative, mouth_frame, mouth_time: see
+            `ObservationSpec`.
         render_size: height and width at which cameras are drawn, before `fit_image` makes the
             images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
@@ -118,6 +119,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         render_size: tuple[int, int] | None = None,
         object_pose: bool = False,
         relative: bool = False,
+        mouth_frame: str = "none",
+        mouth_time: str = "now",
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
         face: str = "visual",
@@ -143,6 +146,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             render_size=render_size,
             object_pose=object_pose,
             relative=relative,
+            mouth_frame=mouth_frame,
+            mouth_time=mouth_time,
             arms=arms,
             corruption=_make_corruption(corruption),
         )

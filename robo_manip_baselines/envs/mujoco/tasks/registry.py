@@ -391,6 +391,8 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "render_size": (list, type(None)),
     "object_pose": (bool,),
     "relative": (bool,),
+    "mouth_frame": (str,),
+    "mouth_time": (str,),
     "arms": (str,),
     "corruption": (dict, type(None)),
     "face": (str,),

@@ -72,6 +72,8 @@ class FeedingEnv(FaceEnv):
     reported k frames of 1/30 s ago; before the start, the first report |
     | ``prediction`` | (5 (H+1),) | ``obs="current_pred"`` | for k = 0 ... H: time (s) and mouth
     x, y, z (m) k frames of 1/30 s ahead; then the H+1 distances gripper-mouth (m) |
+    | ``gripper_from_mouth`` | (3,), per frame with ``mouth_time="forecast"`` |
+    ``mouth_frame="gripper"``, ``"both"`` | gripper less mouth: x, y, z (m) |
     | ``object_position`` | (3,) | ``object_pose=True`` | centre of the cube (m) |
     | ``images/<camera>`` | (height, width, 3) | per camera | RGB |
 
@@ -135,6 +137,9 @@ class FeedingEnv(FaceEnv):
     cropped about their centre and shrunk to ``image_size``; the same if None |
     | ``object_pose`` | False | show the cube's position |
     | ``relative`` | False | show past and future frames of the mouth relative to the present one |
+    | ``mouth_frame`` | "none" | ``gripper`` or ``both`` also show the gripper's position from the
+    mouth; ``actions`` is for policies, and changes nothing here |
+    | ``mouth_time`` | "now" | with ``forecast`` it is shown from the mouth in each frame |
     | ``corruption`` | None | what stands between true and shown mouth: an
     ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
     3}``; None shows the truth |
