@@ -63,6 +63,22 @@ class ReplayOptions:
 
 
 @dataclass(frozen=True)
+class SharedOptions:
+    """A policy that acts until the person takes over.
+
+    Attributes:
+        policy: Policy that acts, for example Act.
+        checkpoint: Folder of a training run, or of one of its checkpoints; or shipped:baseline,
+            shipped:current, shipped:forecast, which come with the package.
+        policy_device: Device of the network: auto, cpu, cuda or cuda:1.
+    """
+
+    policy: str | None = None
+    checkpoint: Path | None = None
+    policy_device: str = "cpu"
+
+
+@dataclass(frozen=True)
 class TeleopOptions:
     """Options of the command.
 
@@ -86,6 +102,7 @@ class TeleopOptions:
         images: Images of the episodes.
         replay: Only with --device replay.
         page: Only with --device web.
+        shared: A policy that acts until the person takes over.
     """
 
     env: tyro.conf.Positional[str]
@@ -105,6 +122,7 @@ class TeleopOptions:
     images: tyro.conf.OmitArgPrefixes[ImageOptions] = field(default_factory=ImageOptions)
     replay: tyro.conf.OmitArgPrefixes[ReplayOptions] = field(default_factory=ReplayOptions)
     page: tyro.conf.OmitArgPrefixes[PageOptions] = field(default_factory=PageOptions)
+    shared: tyro.conf.OmitArgPrefixes[SharedOptions] = field(default_factory=SharedOptions)
 
     def __post_init__(self) -> None:
         require_printable("--operator", self.operator)
@@ -121,8 +139,8 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
     task, images = task_entry(options.env), options.images
     if options.replay.episodes and options.device != "replay":
         raise RequestError("--episodes goes with --device replay; leave it out")
-    spec = ObservationSpec(cameras=images.cameras, image_size=images.image_size)
     limit = options.time_limit
+    spec = ObservationSpec(cameras=images.cameras, image_size=images.image_size)
     return TeleopConfig(
         env=options.env,
         out=options.out or Path("dataset") / "teleop" / options.env,
@@ -139,6 +157,9 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
         env_kwargs=face_arguments(options),
         episodes=options.replay.episodes,
         page=options.page,
+        policy=options.shared.policy,
+        checkpoint=options.shared.checkpoint,
+        policy_device=options.shared.policy_device,
     )
 
 

@@ -82,6 +82,9 @@ class TrainSettings:
             not it has reached the target.
         action_noise: standard deviation of the Gaussian noise that is added, in training, to the
             actions, in units of each element's own (RoboManipBaselines: ``--action_aug_std``).
+        intervention_weight: factor of the error of actions that a person chose instead of the
+            policy (`intervention` of the episodes), before weights are scaled to a mean of 1 over a
+            batch; 1 weights all actions the same. Held-out losses are not weighted.
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
@@ -115,6 +118,7 @@ class TrainSettings:
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
     action_noise: Amount = 0.0
+    intervention_weight: Annotated[float, Interval(gt=0.0, le=1e6)] = 1.0
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
     norm: str | None = None

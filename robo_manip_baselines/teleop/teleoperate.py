@@ -62,6 +62,8 @@ class TeleopConfig:
         env_kwargs: further arguments of the environment.
         episodes: files, or folders of them, for the device ``replay``.
         page: address of the page of the device ``web``.
+        policy, checkpoint: policy that acts until the person takes over; None for none.
+        policy_device: of its network.
 
     Raises:
         RequestError: a value is not valid.
@@ -82,11 +84,19 @@ class TeleopConfig:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     episodes: tuple[Path, ...] = ()
     page: PageOptions = field(default_factory=PageOptions)
+    policy: str | None = None
+    checkpoint: Path | None = None
+    policy_device: str = "cpu"
 
     def __post_init__(self) -> None:
         require_choice("device", self.device, DEVICES)
         require_choice("arm", self.arm, STEERED)
         require_choice("image codec", self.codec, CODECS)
+        if (self.policy is None) != (self.checkpoint is None):
+            raise RequestError(
+                "--policy and --checkpoint: a policy that shares control needs both, for example "
+                "--policy Act --checkpoint shipped:forecast"
+            )
         require_ranges(self)
 
     @property
@@ -122,9 +132,20 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
     if config.cameras and (problem := opengl_problem()):
         raise RequestError(f"--cameras {' '.join(config.cameras)}: {problem}; or --cameras none")
     require_demonstrations_folder(config.out)
-    live = {**kwargs, "cameras": (), "disable_env_checker": True}
+    checkpoint = None
+    live: dict[str, Any] = {**kwargs, "cameras": ()}
+    if config.policy and config.checkpoint:
+        from robo_manip_baselines.teleop.shared import CheckpointPolicy, read_shared
+
+        checkpoint = read_shared(config.policy, config.checkpoint, config.env)
+        if checkpoint.spec.cameras and (problem := opengl_problem()):
+            raise RequestError(f"{problem} (the policy sees images)")
+        live |= checkpoint.spec.env_kwargs()
+    live["disable_env_checker"] = True  # it would miss the images that are not drawn
     with contextlib.closing(make_env(config.env, **live)) as env:
         world = world_of(env)
+        world.renders_images = False
+        policy = checkpoint and CheckpointPolicy(checkpoint, world, config.policy_device)
         wanted = {
             "env_id": config.task.env_id,
             "env_kwargs": kwargs,
@@ -153,6 +174,7 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
                 step_limit=config.step_limit or config.task.max_episode_steps,
                 codec=config.codec,
                 quality=config.quality,
+                policy=policy or None,
             )
             summary = session.run()
             store.finish()
@@ -178,7 +200,12 @@ def open_device(config: TeleopConfig, kwargs: Mapping[str, Any], world: FaceEnv)
     if config.device == "web":
         shown = config.cameras or (() if opengl_problem() else CAMERAS)
         return make_device(
-            "web", world=world, arms=config.steered, cameras=shown, page=config.page
+            "web",
+            world=world,
+            arms=config.steered,
+            has_policy=config.policy is not None,
+            cameras=shown,
+            page=config.page,
         )
     return make_device(config.device, arms=config.steered)
 

@@ -236,7 +236,7 @@ class WebDevice:
         """Show the session, and return what the person did since the last time."""
         is_new = (view.mode, view.seed) != self._resets[:2] or view.step < self._resets[2]
         self._resets = (view.mode, view.seed, view.step)
-        if is_new and view.step == 0 or view.is_policy_acting or not self._hand.goals:
+        if (is_new and view.step == 0) or view.is_policy_acting or not self._hand.goals:
             self._hand.follow(view)
         events: list[TeleopEvent] = []
         while self._actions:
@@ -286,12 +286,12 @@ class WebDevice:
     def _make_controls(self, has_policy: bool, cameras: Sequence[str]) -> None:
         gui = self._server.gui
         gui.configure_theme(
-            control_layout="fixed",
             control_width="large",
             show_share_button=False,
             show_logo=False,
             brand_color=(74, 103, 133),
         )
+        gui.main_panel.dock_right()
         self._status = gui.add_html("")
         self._status_text = ""
         self._buttons: dict[TeleopEvent, Any] = {}
@@ -390,6 +390,7 @@ def status_html(view: SessionView) -> str:
         "time": f"{seconds:.1f} of {limit:.0f} s",
         "task": "done" if view.is_success else "not done yet",
         "arm": view.active_arm,
+        "gripper": " ".join(f"{value:.3f}" for value in view.arms[view.active_arm].position),
         **({"acting": who} if view.has_policy else {}),
         "loop": f"{rate}, {view.missed} late",
     }

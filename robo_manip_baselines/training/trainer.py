@@ -240,6 +240,7 @@ class Trainer:
             skip=settings.skip,
             state_noise=noise,
             action_noise=settings.action_noise,
+            intervention_weight=settings.intervention_weight,
             images=images,
         )
         self.held_out: HeldOutLoss | None = None
