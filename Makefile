@@ -21,13 +21,15 @@ help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "Options: PYTHON=python3.12 (makes .venv with it), MUJOCO_GL=egl|osmesa|glfw, PYTEST_ARGS='-k name'"
 
-demo: setup opengl ## five scripted episodes, a preview video, and three trained policies compared (4 min)
+demo: setup opengl ## five scripted episodes, a preview video, three trained policies compared, and a picture of all tasks (5 min)
 	$(BIN)/python bin/Rollout.py FeedingEnv --scripted --expert servo --motion dyskinetic --cameras none \
 	  --num_episodes 5 --out $(DEMO_DIR)
 	$(BIN)/python bin/Dataset.py verify $(DEMO_DIR)
 	$(BIN)/python bin/Benchmark.py demo --num_episodes 20 --reference shipped_current --out $(DEMO_RESULTS)
+	rm -f $(DEMO_RESULTS)/tasks.png && $(BIN)/python bin/Tasks.py --picture $(DEMO_RESULTS)/tasks.png
 	@echo "Preview video: $$(ls $(DEMO_DIR)/*.mp4)"
 	@echo "Report: $(DEMO_RESULTS)/report.html"
+	@echo "Picture of all tasks: $(DEMO_RESULTS)/tasks.png"
 
 smoke: setup opengl ## a benchmark in miniature, trainings included (3 minutes); part of what CI runs
 	$(BIN)/python bin/Benchmark.py feeding --preset smoke --out $(SMOKE_RESULTS)

@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 # with an underscore, pip before 23.3 does not find the extra
-EXTRAS = "face-prediction,ray,rl,train,dev"
+EXTRAS = "face-prediction,formats,ray,rl,train,dev"
 SUPPORTED = ("3.10", "3.11", "3.12", "3.13")
 # The oldest and newest C library of the machines it is for: 2.28 is that of RHEL 8; Debian 10 and
 # Ubuntu 20.04 are newer still. A wheel may be tagged with any version up to it.

@@ -6,8 +6,10 @@ python benchmarks/expert_safety.py --motions recorded sway turn_away --num_episo
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from robo_manip_baselines.benchmark.report.figures import draw_faces, styled_figure
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
@@ -44,11 +46,24 @@ class Options:
     """PNG of the faces with their contact points."""
 
 
+class ExpertEpisode(NamedTuple):
+    """Episode of a scripted expert.
+
+    Attributes:
+        is_success, is_success_strict, completion_time: as in the last ``info``.
+        safety: of the episode.
+    """
+
+    is_success: bool
+    is_success_strict: bool
+    completion_time: float | None
+    safety: EpisodeSafety
+
+
 def run_expert(
     env: str, expert: str, face: str, motion: str, seeds: range
-) -> tuple[list[bool], list[EpisodeSafety]]:
-    """Let an expert act through episodes; return their success and their safety."""
-    successes, found = [], []
+) -> Iterator[ExpertEpisode]:
+    """Let an expert act through episodes, one a seed."""
     with contextlib.closing(make_env(env, cameras=(), face=face, motion=motion)) as made:
         world = world_of(made)
         world.measures_proximity = True
@@ -61,12 +76,15 @@ def run_expert(
                 _, _, terminated, truncated, info = made.step(actor.act())
                 metrics.update(info)
                 ended = terminated or truncated
-            successes.append(bool(info["is_success"]))
-            found.append(metrics.result(info))
-    return successes, found
+            yield ExpertEpisode(
+                bool(info["is_success"]),
+                bool(info["is_success_strict"]),
+                info["completion_time"],
+                metrics.result(info),
+            )
 
 
-def row_of(face: str, motion: str, successes: list[bool], safety: SafetySummary) -> str:
+def row_of(face: str, motion: str, successes: int, safety: SafetySummary) -> str:
     """Return a row of the table."""
     above = " / ".join(str(safety.above[str(tier)]) for tier in FORCE_TIERS)
     speed = "–"
@@ -78,7 +96,7 @@ def row_of(face: str, motion: str, successes: list[bool], safety: SafetySummary)
     cells = (
         face,
         motion,
-        f"{sum(successes)} of {len(successes)}",
+        f"{successes} of {safety.episodes}",
         f"{safety.safe} of {safety.episodes}",
         f"{safety.force:.1f} ({safety.force_max:.1f})",
         above,
@@ -105,9 +123,11 @@ def main() -> None:
     panels: dict[str, list[EpisodeSafety]] = {}
     for motion in options.motions:
         for face in options.faces:
-            successes, found = run_expert(options.env, options.expert, face, motion, seeds)
+            episodes = list(run_expert(options.env, options.expert, face, motion, seeds))
+            found = [episode.safety for episode in episodes]
             panels[f"{face}, {motion}"] = found
             if summary := summarize_safety(found):
+                successes = sum(episode.is_success for episode in episodes)
                 print(row_of(face, motion, successes, summary), flush=True)
     if options.figure:
         with styled_figure("agg", "white") as figure:

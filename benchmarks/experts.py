@@ -31,6 +31,8 @@ class Options:
     """episode or after_lift."""
     motion: str = "recorded"
     """Of the face, as the option --motion of Rollout.py takes it."""
+    utensil: str = "gripper"
+    """gripper or spoon."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,13 @@ def main() -> None:
     options: Options = parse(Options, "python benchmarks/experts.py --num_episodes 50")
     if options.num_episodes < 1:
         raise RequestError(f"num_episodes {options.num_episodes}: must be 1 or more")
-    env = make_env("FeedingEnv", cameras=(), face_motion=options.face_motion, motion=options.motion)
+    env = make_env(
+        "FeedingEnv",
+        cameras=(),
+        face_motion=options.face_motion,
+        motion=options.motion,
+        utensil=options.utensil,
+    )
     assert isinstance(env.unwrapped, FeedingEnv)
     seeds = range(options.seed, options.seed + options.num_episodes)
     by_expert = {

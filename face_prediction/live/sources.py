@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from face_prediction.tracking.detector import DetectorSettings, FaceDetector, native_stderr_silenced
 from face_prediction.tracking.extract import FaceFollower, ZoomingDetector
-from face_prediction.tracking.geometry import read_canonical_face
+from face_prediction.tracking.geometry import CanonicalFace, read_canonical_face
 from face_prediction.tracking.video import VideoFrame, VideoReader
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -117,10 +117,7 @@ def camera_frames(
 
 @contextmanager
 def face_finder(model: Path) -> Iterator[FindFace]:
-    """A detector that follows one face through successive images.
-
-    Yields a function of an image (rows, columns, 3) uint8 RGB and its time in s, later than the
-    one before, that returns landmarks (468, 3), normalised image coordinates, or None.
+    """A detector that follows one face through successive images, see `follow_face`.
 
     Args:
         model: MediaPipe's face_landmarker.task.
@@ -129,12 +126,22 @@ def face_finder(model: Path) -> Iterator[FindFace]:
         RequestError: MediaPipe is not installed, or the model cannot be loaded.
     """
     with FaceDetector(model, DetectorSettings()) as detector:
-        zooming = ZoomingDetector(detector.detect, read_canonical_face(model))
-        follower = FaceFollower()
+        yield follow_face(detector, read_canonical_face(model))
 
-        def find(image: NDArray[np.uint8], time: float) -> NDArray[np.floating] | None:
-            size = (image.shape[1], image.shape[0])
-            face = follower.choose(zooming.detect(image, time), time, size)
-            return None if face is None else zooming.refine(face, image, time).landmarks
 
-        yield find
+def follow_face(detector: FaceDetector, canonical: CanonicalFace) -> FindFace:
+    """Begin to follow one face through successive images.
+
+    Returns:
+        A function of an image (rows, columns, 3) uint8 RGB and its time in s, later than the one
+        before, that returns landmarks (468, 3), normalised image coordinates, or None.
+    """
+    zooming = ZoomingDetector(detector.detect, canonical)
+    follower = FaceFollower()
+
+    def find(image: NDArray[np.uint8], time: float) -> NDArray[np.floating] | None:
+        size = (image.shape[1], image.shape[0])
+        face = follower.choose(zooming.detect(image, time), time, size)
+        return None if face is None else zooming.refine(face, image, time).landmarks
+
+    return find

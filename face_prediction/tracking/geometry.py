@@ -86,18 +86,24 @@ RIGID_LANDMARKS = (
 eight that move with the mouth: 132, 136, 147, 205 and their mirror images."""
 
 
-def view_size(image_size: Size) -> tuple[float, float]:
-    """Width and height of the image on the plane one unit ahead of the camera."""
-    height = 2 * np.tan(np.radians(VERTICAL_FOV_DEGREES) / 2)
+def view_size(image_size: Size, fov: float = VERTICAL_FOV_DEGREES) -> tuple[float, float]:
+    """Width and height of the image on the plane one unit ahead of the camera.
+
+    ``fov`` is the vertical field of view in degrees, of a camera of which it is known.
+    """
+    height = 2 * np.tan(np.radians(fov) / 2)
     return height * image_size[0] / image_size[1], height
 
 
-def image_rays(points: np.ndarray, image_size: Size) -> np.ndarray:
+def image_rays(
+    points: np.ndarray, image_size: Size, fov: float = VERTICAL_FOV_DEGREES
+) -> np.ndarray:
     """Directions (..., 3) in the camera frame, scaled to z = -1, of points (..., 2 or 3).
 
-    ``points`` are normalised image coordinates (x right / width, y down / height).
+    ``points`` are normalised image coordinates (x right / width, y down / height); ``fov`` as for
+    `view_size`.
     """
-    width, height = view_size(image_size)
+    width, height = view_size(image_size, fov)
     p = np.asarray(points, dtype=float)
     x = (p[..., 0] - 0.5) * width
     return np.stack([x, (0.5 - p[..., 1]) * height, np.full_like(x, -1.0)], axis=-1)

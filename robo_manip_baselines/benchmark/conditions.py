@@ -187,6 +187,7 @@ _NOT_OF_A_CONDITION = (
     # Of the preset:
     *("spec", "cameras", "image_size", "render_size", "object_pose", "arms", "corruption"),
     *("error_stats", "stats_sha256"),  # one file for all conditions
+    *("mouth_source", "camera_latency"),  # policies are trained with the truth
 )
 
 
@@ -313,6 +314,7 @@ def read_conditions(path: Path) -> ConditionFile:
     conditions: list[ConditionConfig] = []
     try:
         task = task_entry(document.env)
+        task.require_env()
         for number, values in enumerate(document.conditions):
             place = f", line {lines[key, number]}"
             condition = ConditionConfig.from_yaml(values).for_task(task)

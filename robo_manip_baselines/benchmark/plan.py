@@ -23,6 +23,7 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.observation.error_stats import load_error_stats
+from robo_manip_baselines.observation.spec import ImageSize
 from robo_manip_baselines.policy.checkpoint import ACTING_FILES, read_checkpoint
 from robo_manip_baselines.rollout.demonstrate import Collection
 from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
@@ -43,6 +44,7 @@ class BenchmarkPreset:
     Attributes:
         train_preset: preset of the policies.
         cameras: of the demonstrations; none shows the positions of the objects instead.
+        image_size: of the demonstrations, from which the policies' images are made.
         demonstrations: episodes of each expert, seeds from 0.
         demonstration_block: of them in a work item.
         num_episodes: evaluation episodes of each trained policy, seeds from 1000.
@@ -71,6 +73,7 @@ class BenchmarkPreset:
     demonstration_block: Episodes
     num_episodes: Episodes
     episode_block: Episodes
+    image_size: ImageSize = ObservationSpec().image_size
     train_seeds: Count = 1
     train_settings: Mapping[str, Any] = field(default_factory=dict)
     num_envs: Count = 8
@@ -96,6 +99,17 @@ PRESETS: dict[str, BenchmarkPreset] = {
         num_episodes=100,
         episode_block=50,
         seconds={"demonstrations": 2.0, "training": 90.0, "evaluation": 1.2, "video": 40.0},
+    ),
+    # Two CPU cores and three cameras, drawn at twice the size that policies are shown or more.
+    "cpu_images": BenchmarkPreset(
+        train_preset="cpu_images",
+        cameras=CAMERAS,
+        image_size=(240, 320),
+        demonstrations=50,
+        demonstration_block=10,
+        num_episodes=100,
+        episode_block=25,
+        seconds={"demonstrations": 9.0, "training": 1500.0, "evaluation": 4.0, "video": 40.0},
     ),
     # The paper's setting (Table III, section IV.C): three cameras, 50 demonstrations, 50 episodes.
     "paper": BenchmarkPreset(
@@ -219,7 +233,7 @@ class Plan:
         variant = condition.expert
         env_kwargs: dict[str, Any] = {
             "cameras": self.preset.cameras,
-            "image_size": ObservationSpec().image_size,
+            "image_size": self.preset.image_size,
             "face_motion": "episode",
         }
         if self.library:

@@ -50,3 +50,8 @@ def run_replay() -> NoReturn:
 def run_teleop() -> NoReturn:
     """Run ``rmb-teleop``."""
     run("teleop")
+
+
+def run_tasks() -> NoReturn:
+    """Run ``rmb-tasks``."""
+    run("tasks")

@@ -72,7 +72,8 @@ class BenchmarkOptions:
         benchmark: Name of the benchmark: feeding, delay, foresight_policies; demo, of the
             checkpoints that come with the package, without training; or foresight, a study without
             policies that has options of its own (foresight --help).
-        preset: Size: cpu (without images), paper (three cameras, a GPU) or smoke (three minutes).
+        preset: Size: cpu (without images), cpu_images (three cameras), paper (three cameras, a GPU)
+            or smoke (three minutes).
         conditions: Names of conditions, with spaces or commas between them; those of the preset if
             not given.
         conditions_file: YAML file of conditions; the one that ships with the package if not given.

@@ -1,4 +1,4 @@
-"""``bin/Dataset.py``: inspect, verify, draw, compare, merge and split episodes."""
+"""``bin/Dataset.py``: inspect, draw, compare, merge, split, export and import episodes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from annotated_types import Interval
 
+from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.runs.browser import PageOptions, require_viser
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
+from robo_manip_baselines.runs.images import CODECS
 from robo_manip_baselines.runs.progress import closing_table
 from robo_manip_baselines.runs.ranges import NonNegativeInt, Seed
 
@@ -335,8 +337,9 @@ def dataset_info(folder: Path) -> dict[str, str]:
     durations = [item["num_steps"] * item["control_period"] for item in metadata]
     times = [item["completion_time"] for item in metadata if item["is_success"]]
     mixture = _mixture(metadata)
-    subjects = {item["motion_subject"] for item in metadata}
-    clips = {item["motion_clip"] for item in metadata}
+    # Episodes that were imported have no face.
+    subjects = {item["motion_subject"] for item in metadata if "motion_subject" in item}
+    clips = {item["motion_clip"] for item in metadata if "motion_clip" in item}
     return {
         "folder": str(folder),
         "demonstrations": str(len(paths)),
@@ -387,14 +390,127 @@ def _spread(values: list[float]) -> str:
     return f"{mean(values):.2f} ± {deviation:.2f} s (mean ± sd of {n}; {ends})"
 
 
-COMMANDS = Info | Verify | Plot | View | Merge | Split | Compare | Tile
+ForeignFolder = Annotated[
+    Path,
+    tyro.conf.arg(metavar="DIR", help="Folder of episodes of the other program."),
+    tyro.conf.Positional,
+]
+OutFolder = Annotated[
+    Path, tyro.conf.arg(metavar="OUT", help="Folder to write."), tyro.conf.Positional
+]
+
+EXPORTS = ("lerobot", "rmb", "aloha")
+IMPORTS = ("rmb", "aloha")
+LEROBOT_ONLY = ("obs", "horizon", "object_pose", "relative", "corruption", "cameras", "recorded")
+"""Options of an export that the other formats have no use for: they hold the recorded state."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write demonstrations for LeRobot, RoboManipBaselines or ALOHA. Killed, it goes on."""
+
+    folder: EpisodeFolder
+    out: OutFolder
+    format: str
+    """Format: lerobot (LeRobot v3.0), rmb (RoboManipBaselines) or aloha (public ACT)."""
+    obs: str = "baseline"
+    """Observation preset of `observation.state`: baseline, current, current_pred, history."""
+    horizon: int = 2
+    """Frames of 1/30 s that current_pred looks ahead."""
+    object_pose: bool = False
+    """Positions of the objects in `observation.state`, too."""
+    relative: bool = False
+    """The mouth in other frames relative to the present one."""
+    corruption: tyro.conf.OmitArgPrefixes[Corruption] = field(default_factory=Corruption)
+    cameras: tuple[str, ...] | None = None
+    """Cameras to export, or none; all that were recorded if not given."""
+    recorded: bool = True
+    """Every field of the episode files, too, as features recorded.<field> of LeRobot."""
+    video_codec: str | None = None
+    """Codec of the videos: libsvtav1 (lerobot's default), h264 (rmb's), hevc or lossless."""
+    crf: int | None = None
+    """Quality of the videos, lower is better; 30 for libsvtav1, 23 for h264, 28 for hevc."""
+    gop: int | None = None
+    """Frames from one key frame to the next; 2 for lerobot, 10 for rmb."""
+
+    def run(self) -> tuple[str, int]:
+        """Return the text to print and the exit code."""
+        require_choice("format", self.format, EXPORTS)
+        if self.format != "lerobot":
+            self._require_unused(LEROBOT_ONLY)
+        if self.format == "aloha":
+            self._require_unused(("video_codec", "crf", "gop"))
+        _require_elsewhere(self.folder, self.out)
+        return closing_table(self._export()), 0
+
+    def _export(self) -> dict[str, str]:
+        from robo_manip_baselines.data.formats.aloha import export_aloha
+        from robo_manip_baselines.data.formats.lerobot import LeRobotRequest, export_lerobot
+        from robo_manip_baselines.data.formats.rmb import ENCODING, export_rmb
+        from robo_manip_baselines.data.formats.video import VIDEO_CODECS, VideoEncoding
+
+        if self.format == "aloha":
+            return export_aloha(self.folder, self.out)
+        usual = VideoEncoding() if self.format == "lerobot" else ENCODING
+        codec = require_choice("video codec", self.video_codec or usual.codec, VIDEO_CODECS)
+        crf = VIDEO_CODECS[codec] if self.crf is None else self.crf
+        encoding = VideoEncoding(codec, crf, usual.gop if self.gop is None else self.gop)
+        if self.format == "rmb":
+            return export_rmb(self.folder, self.out, encoding)
+        chosen = {name: getattr(self, name) for name in LEROBOT_ONLY}
+        return export_lerobot(self.folder, self.out, LeRobotRequest(**chosen, encoding=encoding))
+
+    def _require_unused(self, names: Sequence[str]) -> None:
+        """Refuse options that the format has no use for."""
+        defaults = Export(self.folder, self.out, self.format)
+        for name in names:
+            if getattr(self, name) != getattr(defaults, name):
+                raise RequestError(f"--{name}: not for the format {self.format}; leave it out")
+
+
+def _require_elsewhere(folder: Path, out: Path) -> None:
+    """Refuse to write into the folder that is read, or to a file."""
+    if out.exists() and not out.is_dir():
+        raise RequestError(f"OUT '{out}': is a file; name a folder")
+    if out.resolve() == folder.resolve():
+        raise RequestError(f"OUT '{out}': is read; name another folder")
+
+
+@dataclass(frozen=True)
+class Import:
+    """Make episode files of episodes of RoboManipBaselines or ALOHA. Killed, it goes on."""
+
+    folder: ForeignFolder
+    out: OutFolder
+    format: str
+    """Format: rmb (RoboManipBaselines) or aloha (public ACT)."""
+    cameras: tuple[str, ...] | None = None
+    """Names here of the cameras there, such as top=cam_high; those that are not named are left
+    out."""
+    image_codec: str = "png"
+    """Codec of the images: png (lossless), jpeg or raw."""
+
+    def run(self) -> tuple[str, int]:
+        """Return the text to print and the exit code."""
+        from robo_manip_baselines.data.formats.aloha import import_aloha
+        from robo_manip_baselines.data.formats.rmb import import_rmb
+
+        require_choice("format", self.format, IMPORTS)
+        require_choice("image codec", self.image_codec, CODECS)
+        _require_elsewhere(self.folder, self.out)
+        given = None if self.cameras is None else list(self.cameras)
+        read = {"rmb": import_rmb, "aloha": import_aloha}[self.format]
+        return closing_table(read(self.folder, self.out, cameras=given, codec=self.image_codec)), 0
+
+
+COMMANDS = Info | Verify | Plot | View | Merge | Split | Compare | Tile | Export | Import
 """Subcommands, in the order of --help."""
 
 
 def main(args: Sequence[str]) -> int:
     """Run ``bin/Dataset.py``."""
     example = "python bin/Dataset.py verify dataset/FeedingEnv"
-    description = "Inspect, verify, draw, compare, merge and split episodes."
+    description = "Inspect, verify, draw, compare, merge, split, export and import episodes."
     text, code = parse(COMMANDS, example, description=description, args=args).run()
     if text:
         print(text)  # noqa: T201

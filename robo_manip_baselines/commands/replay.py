@@ -24,6 +24,8 @@ class ReplayOptions:
     """Episode files, or folders of them."""
     video: Path | None = None
     """Write an H.264 video of the replayed episodes here."""
+    view: bool = False
+    """Show the episodes in MuJoCo's viewer, in real time."""
 
 
 def replay_episodes(options: ReplayOptions) -> int:
@@ -34,7 +36,7 @@ def replay_episodes(options: ReplayOptions) -> int:
     """
     # Imported here: --help needs no simulator.
     from robo_manip_baselines.data import list_episodes
-    from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+    from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, require_viewer
     from robo_manip_baselines.rollout.demonstrate import deviation
     from robo_manip_baselines.rollout.videos import write_preview
 
@@ -47,9 +49,11 @@ def replay_episodes(options: ReplayOptions) -> int:
         require_out_file(options.video, VIDEO, paths, option="--video")
         if problem := opengl_problem():
             raise RequestError(f"--video {options.video}: {problem}")
+    if options.view:
+        require_viewer()
     strays = 0
     for path in paths:
-        found = deviation(path)
+        found = deviation(path, is_watched=options.view)
         strays += found.qpos > 0.0 or found.qvel > 0.0
         within = f"qpos within {found.qpos:g}, qvel within {found.qvel:g}"
         print(f"{path}: {found.steps} steps, {within}")  # noqa: T201

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import tyro
 from annotated_types import Interval
 
-from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, require_viewer
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
@@ -37,13 +37,17 @@ DESCRIPTION = (
     "(--policy, --checkpoint)."
 )
 
+PERCEPTION = ("mouth_source", "camera_latency")
+"""Parts of the observation that may differ between training and evaluation."""
+
 UNTRAINED = ObservationSpec("current_pred")
 """Defaults of the observation where no checkpoint gives them."""
 
 PREVIEW = "preview.mp4"
 
-RECORDED = ("cameras", "image_size", "arms")
-"""Parts of the observation that demonstrations hold; they hold the truth behind the others."""
+RECORDED = ("cameras", "image_size", "arms", *PERCEPTION)
+"""Parts of the observation that demonstrations hold, or that their expert goes by; they hold the
+truth behind the others."""
 
 logger = logging.getLogger(__name__)
 
@@ -119,9 +123,12 @@ class RolloutOptions:
         people: People who move: all, or train or test for demonstrations and evaluation with
             different people. If not given, all, and test for a policy that learnt from train.
         clips: Recorded clips to draw from; if not given, all, or those of the demonstrations.
+        utensil: What brings the food in FeedingEnv: gripper or spoon. If not given, gripper, or as
+            in the demonstrations of the policy.
         motion_library: File of recorded face motion, or extended, which ships, too, and has more
             people. If not given, the one that ships, or that of the demonstrations.
         workers: Processes in which environments step; with --policy, 0 steps them in the main one.
+        view: Show the episodes in MuJoCo's viewer, one after another, in real time.
         spec: Observation. With --scripted, cameras and image_size are recorded; with --policy, the
             observation is that of the checkpoint, and options are checked against it.
         corruption: --no_corruption shows the truth, whatever the checkpoint and other options say.
@@ -140,8 +147,10 @@ class RolloutOptions:
     motion: str | None = None
     people: str | None = None
     clips: tuple[str, ...] = ()
+    utensil: str | None = None
     motion_library: Path | None = None
     workers: Processes = 2
+    view: bool = False
     spec: tyro.conf.OmitArgPrefixes[ObservationSpec] = field(default_factory=lambda: UNTRAINED)
     corruption: bool = True
     demonstration: tyro.conf.OmitArgPrefixes[ScriptedOptions] = field(
@@ -155,9 +164,16 @@ class RolloutOptions:
         return range(start, start + self.num_episodes)
 
     @property
-    def face_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment about the face and its motion that were given."""
-        return face_arguments(self)
+    def env_arguments(self) -> dict[str, Any]:
+        """Arguments of the environment that were given: of the face, and of the task alone.
+
+        Raises:
+            RequestError: one is not valid, or the task has no such argument.
+        """
+        given = face_arguments(self)
+        if self.utensil is not None:
+            given["utensil"] = task_entry(self.env).require_argument("utensil", self.utensil)
+        return given
 
 
 class FaceOptions(Protocol):
@@ -219,6 +235,8 @@ def require_consistent(options: RolloutOptions) -> None:
     if changed:
         wanted = "--policy" if options.scripted else "--scripted"
         raise RequestError(f"--{changed[0]} goes with {wanted}; leave it out")
+    if options.view:
+        require_viewer()
 
 
 def _changed_options(given: Any, default: Any) -> list[str]:
@@ -249,15 +267,18 @@ def to_collection(options: RolloutOptions) -> Collection:
     env_kwargs: dict[str, Any] = {"cameras": spec.cameras, "image_size": spec.image_size}
     if spec.arms != task_entry(options.env).arms[0]:
         env_kwargs["arms"] = spec.arms
+    if spec.sees_by_camera:
+        env_kwargs |= {name: getattr(spec, name) for name in PERCEPTION}
     return Collection(
         env=options.env,
         out=options.out or Path("dataset") / options.env,
         expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
         seeds=options.seeds(first=0),
-        env_kwargs={**env_kwargs, "face_motion": "episode", **options.face_arguments},
+        env_kwargs={**env_kwargs, "face_motion": "episode", **options.env_arguments},
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
+        is_watched=options.view,
     )
 
 
@@ -313,7 +334,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
     from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 
     policy_entry(options.policy or "")
-    task_entry(options.env)
+    task_entry(options.env).require_env()
     given = options.evaluation
     if given.checkpoint is None or checkpoint is None:
         raise RequestError(
@@ -323,13 +344,15 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
     typed = {"policy": options.policy, "environment": options.env, **vars(options.spec)}
     values = {"policy": checkpoint.policy, "environment": checkpoint.env, **vars(trained)}
     for name, value in values.items():
-        if name != "corruption" and typed[name] != value:
+        if name not in ("corruption", *PERCEPTION) and typed[name] != value:
             raise RequestError(
                 f"checkpoint '{checkpoint.folder}' was trained with {name} {_as_typed(value)}, not "
                 f"{_as_typed(typed[name])}; leave the option as trained, or train another policy"
             )
     corruption = (options.spec.corruption if options.corruption else Corruption()).pinned()
-    is_given = options.corruption and not corruption.is_same_as(trained.corruption)
+    by_camera = options.spec.sees_by_camera  # in place of the corruption
+    is_given = options.corruption and not by_camera
+    is_given = is_given and not corruption.is_same_as(trained.corruption)
     if is_given and not given.change_corruption:
         raise RequestError(
             f"checkpoint '{checkpoint.folder}' was trained with {trained.corruption}, not with "
@@ -340,8 +363,10 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         checkpoint=given.checkpoint,
         seeds=options.seeds(FIRST_SEED),
         out=options.out,
-        env_kwargs=options.face_arguments,
-        corruption=None if corruption == trained.corruption else corruption,
+        env_kwargs=options.env_arguments,
+        corruption=None if by_camera or corruption == trained.corruption else corruption,
+        mouth_source=options.spec.mouth_source,
+        camera_latency=options.spec.camera_latency,
         temporal_ensemble=given.temporal_ensemble,
         n_action_steps=given.n_action_steps,
         strategy=given.strategy,
@@ -351,6 +376,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         device=given.device,
         precision=given.precision,
         videos=given.video,
+        is_watched=options.view,
     )
 
 
@@ -382,10 +408,13 @@ def parse_options(args: Sequence[str]) -> tuple[RolloutOptions, Checkpoint | Non
             corruption = replace(corruption, error_stats=None, stats_sha256=None)
         elif last_value(args, "error_stats"):
             corruption = replace(corruption, stats_sha256=None)
+        if last_value(args, "mouth_source") not in (None, "truth"):
+            corruption = Corruption()  # a camera has errors of its own
         spec = replace(checkpoint.spec, corruption=corruption)
     default = RolloutOptions(tyro.MISSING, spec=spec)
     options = parse(RolloutOptions, EXAMPLE, description=DESCRIPTION, args=args, default=default)
     require_consistent(options)
+    task_entry(options.env).require_env()
     if options.scripted and not last_value(args, "arms"):
         arms = task_entry(options.env).arms[0]
         options = replace(options, spec=replace(options.spec, arms=arms))

@@ -13,6 +13,7 @@ from typing import Any, Generic
 
 import tyro
 
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.policy.registry import policy_names, policy_presets
 from robo_manip_baselines.runs.checkpoints import BEST, list_checkpoints
@@ -221,5 +222,6 @@ def main(args: Sequence[str]) -> int:
         return code
     evaluate = f"python bin/Rollout.py {config.env} --policy {config.policy} --checkpoint {out}"
     table = summary(config, before[-1][0] if before else 0)
-    print(f"{table}\nnext: {evaluate}")  # noqa: T201
+    has_env = bool(task_entry(config.env).env)
+    print(f"{table}\nnext: {evaluate}" if has_env else table)  # noqa: T201
     return 0

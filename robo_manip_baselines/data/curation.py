@@ -137,7 +137,8 @@ def split_dataset(source: Path, out: Path, request: SplitRequest) -> Copied:
     """
     metadata = _read_sources([source], out)
     kept = {p: item for p, item in metadata.items() if p.parent.name != FAILED_FOLDER}
-    split = choose_split({item["seed"]: item["motion_subject"] for item in kept.values()}, request)
+    people = {item["seed"]: item.get("motion_subject", "") for item in kept.values()}
+    split = choose_split(people, request)
     place = dict.fromkeys(split.train, PARTS[0]) | dict.fromkeys(split.validation, PARTS[1])
     files = {Path(place[item["seed"]], path.name): path for path, item in kept.items()}
     options = {"fraction": request.fraction, "seed": request.seed, "by": request.by}

@@ -49,8 +49,10 @@ def draw_episode(figure: Any, episode: EpisodeReader) -> None:
         _finish(axes, episode, is_last=number >= len(curves) - 2)
     task, seed = attributes["env_id"].rpartition("/")[2], attributes["seed"]
     end = "success" if attributes["is_success"] else "no success"
-    motion = attributes["env_kwargs"].get("motion", "recorded")
-    source = f"{attributes['expert']}, motion {motion} ({attributes['motion_clip']})"
+    source = attributes["expert"]
+    if episode.task.target_field:
+        motion = attributes["env_kwargs"].get("motion", "recorded")
+        source += f", motion {motion} ({attributes['motion_clip']})"
     figure.suptitle(f"{task}, seed {seed}: {source}; {end}", fontsize=11)
 
 
@@ -60,6 +62,8 @@ def _draw_way(axes: Any, episode: EpisodeReader) -> None:
     gripper, target = arrays["end_effector_position"], _target(episode)
     for axis, (name, color) in enumerate(zip(AXES, COLORS, strict=True)):
         axes.plot(time, gripper[:, axis], color=color, label=f"gripper {name}")
+        if target is None:
+            continue
         axes.plot(time, target[:, axis], "--", color=color, label=f"{_target_name(episode)} {name}")
     axes.set_ylabel("m, world")
     axes.legend(ncols=6, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0))
@@ -75,7 +79,10 @@ def _draw_way(axes: Any, episode: EpisodeReader) -> None:
 
 def _draw_distance(axes: Any, episode: EpisodeReader) -> None:
     """Draw the distance between gripper and target."""
-    offset = episode.arrays["end_effector_position"] - _target(episode)
+    if (target := _target(episode)) is None:
+        axes.set_axis_off()
+        return
+    offset = episode.arrays["end_effector_position"] - target
     axes.plot(episode.arrays["time"], 100.0 * np.linalg.norm(offset, axis=1), color="#333333")
     axes.set_ylabel(f"to {_target_name(episode)}, cm")
     axes.set_ylim(bottom=0.0)
@@ -95,8 +102,10 @@ def _finish(axes: Any, episode: EpisodeReader, *, is_last: bool) -> None:
         axes.tick_params(labelbottom=False)
 
 
-def _target(episode: EpisodeReader) -> np.ndarray:
-    """(T, 3) m, world: the true target at each step."""
+def _target(episode: EpisodeReader) -> np.ndarray | None:
+    """(T, 3) m, world: the true target at each step; None where the episode has none."""
+    if not episode.task.target_field:
+        return None
     return episode.arrays[episode.task.target_field][:, 0]
 
 

@@ -33,6 +33,8 @@ from robo_manip_baselines.runs.ranges import Seed
 def recorded_state(episode: EpisodeReader) -> State:
     """Read the (T, ...) state of an episode of one arm or of both.
 
+    Where the episode has no target, its position is NaN.
+
     Raises:
         EpisodeFileError: a field is missing or damaged.
     """
@@ -40,6 +42,7 @@ def recorded_state(episode: EpisodeReader) -> State:
     has_prediction = task.predicted_field in episode.fields
     by_arm = array("gripper_position").shape  # (T, A)
     objects = [array(name)[:, None, :3] for name in task.object_fields]
+    nowhere = np.full((len(episode), 1, 3), np.nan)
     return State(
         time=array("time"),
         joint_position=array("joint_position").reshape(*by_arm, -1),
@@ -47,7 +50,7 @@ def recorded_state(episode: EpisodeReader) -> State:
         gripper_position=array("gripper_position"),
         gripper_velocity=array("gripper_velocity"),
         end_effector_position=array("end_effector_position"),
-        target_position=array(task.target_field),
+        target_position=array(task.target_field) if task.target_field else nowhere,
         object_position=np.concatenate([np.empty((len(episode), 0, 3)), *objects], axis=1),
         predicted_target=array(task.predicted_field) if has_prediction else None,
     )
@@ -200,6 +203,12 @@ def load_demonstrations(
         EpisodeFileError: a file is damaged, was changed after it was recorded, or is in use.
     """
     folder = Path(folder)
+    if spec.sees_by_camera:
+        raise RequestError(
+            f"mouth_source {spec.mouth_source}: demonstrations hold the true mouth; train with "
+            "truth, with an error if wanted, and evaluate by camera: bin/Rollout.py --policy ... "
+            f"--mouth_source {spec.mouth_source}"
+        )
     # With the digest of the statistics, so that a policy is evaluated with those it learnt from.
     spec = replace(spec, corruption=spec.corruption.pinned())
     pipeline = spec.make_pipeline()
@@ -300,6 +309,8 @@ def _require_same(
 def _frames_ahead(episode: EpisodeReader) -> tuple[int, int]:
     """Return how many frames ahead the target is known, and predicted (0 without predictions)."""
     task = episode.task
+    if not task.target_field:
+        return 0, 0
     has_prediction = task.predicted_field in episode.fields
     predicted = episode.array(task.predicted_field).shape[1] if has_prediction else 0
     return episode.array(task.target_field).shape[1] - 1, predicted
@@ -319,7 +330,7 @@ def _forecaster(
     from robo_manip_baselines.envs.mujoco.face.forecasters import MotionForecasters
 
     with EpisodeReader(path) as episode:
-        episode.task.require_forecasts(spec.corruption)
+        episode.task.require_forecasts(spec)
         made = MotionForecasters.of_kwargs(episode.attributes["env_kwargs"])
     return lambda track, seed: made.forecast_track(name, track, seed)
 
@@ -339,6 +350,11 @@ def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:
         )
     if spec.object_pose and not episode.task.names.objects:
         raise RequestError(f"object_pose: {episode.task.name} has no objects; leave it out")
+    if spec.frames and not episode.task.target_field:
+        raise RequestError(
+            f"'{path}' was imported and holds no face: it shows nothing for {spec.obs}; choose "
+            "--obs baseline"
+        )
     known, predicted = _frames_ahead(episode)
     if spec.frames - 1 > known:
         again = path.parent.with_name(f"{path.parent.name}_longer")

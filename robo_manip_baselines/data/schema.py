@@ -73,7 +73,8 @@ SYMBOLS: Mapping[str, str] = {
     "H": "frames of the forecast: 1 to 24, as many as the motion library holds; the shipped one, 5",
     "R": "regions of the face: forehead, eyes, nose, cheeks, lips, chin, tongue, teeth, mouth (its "
     "other walls inside), head (sides and back), neck (with the bust)",
-    "B": "what touches it: gripper, arm, anything else, then the objects of the task in order",
+    "B": "what touches it: gripper, arm, anything else, then the objects of the task in order, and "
+    "a tool in the gripper (`spoon`)",
 }
 ALLOWED_SIZES: Mapping[str, tuple[int, ...]] = {
     "A": (7, 14),

@@ -20,7 +20,11 @@ from numpy.typing import NDArray
 from tyro.constructors import PrimitiveConstructorSpec
 
 from robo_manip_baselines.observation.arm import ARM_JOINTS
-from robo_manip_baselines.observation.corruption import Corruption, CorruptionPipeline
+from robo_manip_baselines.observation.corruption import (
+    MAX_DELAY,
+    Corruption,
+    CorruptionPipeline,
+)
 from robo_manip_baselines.observation.state import (
     FRAME_PERIOD,
     MAX_HORIZON,
@@ -49,6 +53,16 @@ MOUTH_TIMES = ("now", "forecast")
 """Mouth that it is relative to: the one observed, or the one forecast for when an action acts."""
 
 MAX_IMAGE_SIZE = 4096
+
+MOUTH_SOURCES = ("truth", "camera", "depth_camera")
+"""Where the mouth in observations comes from: the simulator's truth, through the corruption, or a
+face detector that looks at images of ``front_close``, without or with their depth."""
+
+MEASURED = "measured"
+"""Latency of the camera: as long as detector and predictor take."""
+
+CameraLatency = Annotated[int, Interval(ge=0, le=MAX_DELAY)] | str
+"""Frames of 1/30 s, or ``MEASURED``."""
 
 
 def parse_image_size(size: str) -> tuple[int, int]:
@@ -118,6 +132,10 @@ class ObservationSpec:
         mouth_time: Mouth of the mouth_frame: now, the one observed, or with current_pred forecast,
             for the time at which the arm is where an action sends it.
         corruption: Corruption of the target between simulator and policy.
+        mouth_source: Source of the mouth: truth, or camera: a face detector finds it in images of
+            front_close, at its distance by the size of the head; depth_camera: by a depth image.
+        camera_latency: Frames of 1/30 s from an image to what was found in it; measured: the time
+            that detector and predictor take on this machine, so that results differ between runs.
 
     Raises:
         RequestError: a value is not valid.
@@ -134,6 +152,8 @@ class ObservationSpec:
     mouth_frame: str = "none"
     mouth_time: str = "now"
     corruption: Corruption = field(default_factory=Corruption)
+    mouth_source: str = "truth"
+    camera_latency: CameraLatency = 1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", _camera_names(self.cameras))
@@ -159,6 +179,7 @@ class ObservationSpec:
                 f"corruption {self.corruption!r}: must be a Corruption, or a dict of its settings, "
                 "for example {'error': 'uniform'}"
             )
+        self._check_mouth_source()
         if not self.corruption:
             object.__setattr__(self, "corruption", Corruption())
         elif not self.frames:
@@ -175,6 +196,25 @@ class ObservationSpec:
                 f"which the observation preset '{self.obs}' shows none; choose current_pred, or "
                 f"the {what} {off} (delay, face_dropout and detector_rate go with '{self.obs}', "
                 "too)"
+            )
+
+    def _check_mouth_source(self) -> None:
+        """Check source and latency; the latency of a camera that is not used is the default."""
+        require_choice("mouth source", self.mouth_source, MOUTH_SOURCES)
+        if self.camera_latency != MEASURED:
+            if isinstance(self.camera_latency, str):
+                raise RequestError(
+                    f"camera_latency '{self.camera_latency}': must be a number of frames of 1/30 s "
+                    f"or {MEASURED}"
+                )
+            unit = f" frames of 1/30 s, or {MEASURED}"
+            require_integer("camera_latency", self.camera_latency, 0, MAX_DELAY, unit)
+        if not self.sees_by_camera:
+            object.__setattr__(self, "camera_latency", type(self).camera_latency)
+        elif self.corruption:
+            raise RequestError(
+                f"mouth_source '{self.mouth_source}' has errors and a latency of its own, and goes "
+                f"without '{self.corruption.label}'; leave the corruption out"
             )
 
     def _check_mouth_frame(self) -> None:
@@ -218,6 +258,8 @@ class ObservationSpec:
         for name in ("relative", "mouth_frame", "mouth_time"):
             if values[name] in (False, "none", "now"):
                 del values[name]
+        if not self.sees_by_camera:
+            del values["mouth_source"], values["camera_latency"]
         if self.corruption.prediction == "truth":
             del corruption["prediction"]
         return values | {"corruption": corruption} if self.corruption else values
@@ -246,7 +288,20 @@ class ObservationSpec:
         relative = "_relative" if self.relative else ""
         mouth = "" if self.mouth_frame == "none" else f"_mouth_{self.mouth_frame}"
         ahead = "_forecast" if self.mouth_time == "forecast" else ""
-        return f"{self.obs}{horizon}{relative}{mouth}{ahead}{corruption}"
+        return f"{self.obs}{horizon}{relative}{mouth}{ahead}{corruption}{self._camera_name}"
+
+    @property
+    def _camera_name(self) -> str:
+        """End of the name where the mouth comes from a camera, such as ``_camera_latency2``."""
+        if not self.sees_by_camera:
+            return ""
+        is_usual = self.camera_latency == type(self).camera_latency
+        return f"_{self.mouth_source}" + ("" if is_usual else f"_latency{self.camera_latency}")
+
+    @property
+    def sees_by_camera(self) -> bool:
+        """True if the mouth is found in images, and not read from the simulator."""
+        return self.mouth_source != "truth"
 
     @property
     def drawn_size(self) -> tuple[int, int]:
@@ -311,15 +366,18 @@ class ObservationSpec:
         return {f"images/{camera}": camera for camera in self.cameras}
 
     def make_pipeline(self) -> CorruptionPipeline | None:
-        """Return the corruption pipeline; None where the policy is shown the present truth."""
-        if not self.has_pipeline:
+        """Return the corruption pipeline; None where the policy is shown the present truth.
+
+        None also where a camera takes its place.
+        """
+        if not self.has_pipeline or self.sees_by_camera:
             return None
         return CorruptionPipeline(self.corruption, self.frames - 1, self.past_frames)
 
     @property
     def has_pipeline(self) -> bool:
-        """True if the target is observed through a pipeline: corrupted, or with its past."""
-        return bool(self.corruption or self.past_frames)
+        """True if the target is observed, by a camera, corrupted, or with its past."""
+        return bool(self.sees_by_camera or self.corruption or self.past_frames)
 
     def pack(self, state: State, target: TargetObservation | None = None) -> NDArray[np.float32]:
         """Pack all vectors of an observation into one, (..., S) float32.
@@ -365,9 +423,14 @@ class ObservationSpec:
         self, vector: NDArray[np.float32], names: ObservedNames
     ) -> dict[str, NDArray[np.float32]]:
         """Return the vectors (..., n) of an observation as views of the packed one (..., S)."""
+        return {name: vector[..., part] for name, part in self.slices(names).items()}
+
+    def slices(self, names: ObservedNames) -> dict[str, slice]:
+        """Return where the vectors of an observation are in the packed one."""
         components = self.components(names)
-        ends = np.cumsum([len(part) for part in components.values()])
-        return dict(zip(components, np.split(vector, ends[:-1], axis=-1), strict=True))
+        ends = np.cumsum([len(part) for part in components.values()]).tolist()
+        starts = (0, *ends[:-1])
+        return {name: slice(*span) for name, *span in zip(components, starts, ends, strict=True)}
 
     def target_positions(self, vector: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the target positions, (..., F, 3) m, in packed vectors (..., S).

@@ -69,3 +69,15 @@ class TargetObservation:
     time: Floats
     position: Floats
     past: Floats | None = None
+
+    def at(self, time: float) -> Floats:
+        """Return the target, (3,) m, as it is expected at ``time`` s, of one observation.
+
+        Between two frames on the straight line; after the last one, there.
+        """
+        last = len(self.position) - 1
+        frame = min(max((time - float(self.time)) * FRAME_RATE, 0.0), float(last))
+        before = min(int(frame), max(last - 1, 0))
+        part = frame - before
+        after = min(before + 1, last)
+        return (1.0 - part) * self.position[before] + part * self.position[after]

@@ -21,6 +21,9 @@ SAMPLERS = ("episode", "frame")
 PRECISIONS = ("auto", "fp32", "bf16")
 SCHEDULES = ("constant", "cosine")
 
+AUGMENTATIONS = ("none", "shift", "shift+colour")
+"""Random changes to the images of training batches."""
+
 STRATEGIES = ("synchronous", "naive", "ensemble", "rtc", "rtc_trained", "roll_forward")
 """Names of the ways to execute chunks; all but ``ensemble`` execute one chunk at a time."""
 
@@ -85,6 +88,10 @@ class TrainSettings:
         intervention_weight: factor of the error of actions that a person chose instead of the
             policy (`intervention` of the episodes), before weights are scaled to a mean of 1 over a
             batch; 1 weights all actions the same. Held-out losses are not weighted.
+        augment: random changes to the images in training: ``shift``, ``shift+colour`` (also
+            contrast, brightness and tint) or ``none``.
+        augment_shift: largest shift as a proportion of the images' sides (robomimic crops 76 of 84
+            pixels: ±4.8 %).
         validation_fraction: proportion of the episodes that is held out (public ACT: 0.2).
         ema_decay: decay of the moving average of the weights that is evaluated and saved; 0 for
             none.
@@ -119,6 +126,8 @@ class TrainSettings:
     clock_noise: Amount = 0.0
     action_noise: Amount = 0.0
     intervention_weight: Annotated[float, Interval(gt=0.0, le=1e6)] = 1.0
+    augment: str = "none"
+    augment_shift: Fraction = 0.04
     validation_fraction: Fraction = 0.2
     ema_decay: Fraction = 0.0
     norm: str | None = None
@@ -133,6 +142,7 @@ class TrainSettings:
         require_choice("sampler", self.sampler, SAMPLERS)
         require_choice("precision", self.precision, PRECISIONS)
         require_choice("schedule", self.schedule, SCHEDULES)
+        require_choice("augment", self.augment, AUGMENTATIONS)
         if (self.epochs is None) == (self.steps is None):
             raise RequestError("give the budget as --epochs or as --steps, one of the two")
         require_ranges(self)

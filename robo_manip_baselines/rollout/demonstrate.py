@@ -152,6 +152,8 @@ class EpisodeRecorder:
         time, spec = info["completion_time"], env.spec
         assert spec is not None
         env_kwargs = dict(spec.kwargs)
+        if env_kwargs.get("render_mode") == "human":  # how it was watched
+            del env_kwargs["render_mode"]
         if env_kwargs.get("motion_library"):
             env_kwargs["motion_sha256"] = world.library.sha256
         if "motion" in env_kwargs:
@@ -216,6 +218,7 @@ class Collection:
         env_kwargs: arguments of the environment; held as JSON holds them.
         codec, quality: of the images.
         workers: processes.
+        is_watched: show the episodes in MuJoCo's viewer; they are recorded in this process.
 
     Raises:
         RequestError: a value is not valid.
@@ -229,6 +232,7 @@ class Collection:
     codec: str = "jpeg"
     quality: Quality = DEFAULT_QUALITY
     workers: Annotated[int, Interval(ge=1, le=1024)] = 1
+    is_watched: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "env_kwargs", as_json(self.env_kwargs))
@@ -238,8 +242,10 @@ class Collection:
         require_ranges(self)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what JSON can hold."""
-        return {**asdict(self), "out": str(self.out), "seeds": [self.seeds.start, self.seeds.stop]}
+        """Return what JSON can hold, without ``is_watched``, on which no episode depends."""
+        values = asdict(self)
+        del values["is_watched"]
+        return {**values, "out": str(self.out), "seeds": [self.seeds.start, self.seeds.stop]}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Collection:
@@ -288,7 +294,8 @@ def collect(collection: Collection) -> CollectionSummary:
     # Everything about the request that can be wrong is found out here, before any file exists.
     collection = replace(collection, env_kwargs=pin_library(collection.env_kwargs))
     require_demonstrations_folder(collection.out)
-    with contextlib.closing(make_env(collection.env, **collection.env_kwargs)) as env:
+    watched = {"render_mode": "human"} if collection.is_watched else {}
+    with contextlib.closing(make_env(collection.env, **collection.env_kwargs, **watched)) as env:
         _require_fitting_expert(collection, env)
         _refuse_other_settings(collection, world_of(env).xml_hash)
         with locked(collection.out, is_kept=False):
@@ -350,7 +357,7 @@ def _record_all(
     ``on_steps`` is called with the number of steps taken since its last call.
     """
     workers = min(collection.workers, len(seeds))
-    if workers <= 1:
+    if workers <= 1 or collection.is_watched:
         for seed in seeds:
             yield _record(collection, env, seed, on_steps)
         return
@@ -454,6 +461,12 @@ def _require_fitting_expert(collection: Collection, env: gymnasium.Env[Any, Any]
     world = world_of(env)
     env.reset(seed=collection.seeds.start)
     actor = world.task.make_expert(collection.expert, world)
+    if world.camera_mouth and not getattr(actor, "goes_by_observation", False):
+        raise RequestError(
+            f"mouth_source {world.observation_spec.mouth_source}: the expert "
+            f"'{collection.expert}' of {collection.env} knows the true mouth; leave it out, or "
+            "choose an expert that goes by what is observed: servo of FeedingEnv or DrinkingEnv"
+        )
     actor.reset()
     action = actor.act()
     if action.shape != env.action_space.shape:
@@ -547,7 +560,8 @@ def remake_env(episode: EpisodeReader, **changes: Any) -> gymnasium.Env[Any, Any
     recorded = episode.attributes
     task = entry_of_id(recorded["env_id"])
     kwargs = {**recorded["env_kwargs"], **changes}
-    kwargs.pop("error", None)  # of older releases; it says what was shown
+    for name in ("error", "mouth_source", "camera_latency"):  # ``error`` is of older releases
+        kwargs.pop(name, None)  # they say what was shown to whom the recorded actions are
     env = make_env(task.name, **kwargs)
     xml_hash = world_of(env).xml_hash
     if xml_hash != recorded["xml_hash"]:
@@ -568,13 +582,21 @@ def replay(env: gymnasium.Env[Any, Any], episode: EpisodeReader) -> Iterator[int
         env.step(action)
 
 
-def deviation(path: Path) -> Deviation:
+def deviation(path: Path, *, is_watched: bool = False) -> Deviation:
     """Replay an episode and compare every state with the recorded one.
+
+    Args:
+        path: of the episode.
+        is_watched: show it in MuJoCo's viewer, in real time.
 
     Raises:
         RequestError: the file is damaged, or of another model.
     """
-    with EpisodeReader(path) as episode, contextlib.closing(remake_env(episode, cameras=())) as env:
+    mode = "human" if is_watched else None
+    with (
+        EpisodeReader(path) as episode,
+        contextlib.closing(remake_env(episode, cameras=(), render_mode=mode)) as env,
+    ):
         qpos, qvel = episode.array("qpos"), episode.array("qvel")
         data = world_of(env).data
         worst = np.zeros(2)

@@ -295,6 +295,7 @@ class EpisodePage:
         """Open an episode and draw what does not depend on the step."""
         self._stack.close()
         self._reader = self._stack.enter_context(EpisodeReader(path))
+        self._reader.task.require_env()
         self.shown, self.step = path, -1
         self._played_from = (self._clock(), 0)
         self._shown_speed = SPEEDS[self._speed.value]

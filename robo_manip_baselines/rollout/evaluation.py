@@ -20,8 +20,9 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary, pin_library
 from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
-from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
-from robo_manip_baselines.observation import Corruption
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry, without_library_path
+from robo_manip_baselines.observation import Corruption, ObservationSpec
+from robo_manip_baselines.observation.spec import CameraLatency
 from robo_manip_baselines.policy.checkpoint import (
     SHIPPED_PREFIX,
     Checkpoint,
@@ -64,6 +65,12 @@ FIRST_SEED = 1000
 
 VIDEOS = "videos"
 
+SOFTWARE = ("mujoco", "numpy", "robo_manip_baselines", "torch")
+"""Software whose versions result rows hold."""
+
+DETECTOR = ("mediapipe",)
+"""Likewise, where the mouth is found in images."""
+
 OnEpisode = Callable[[EpisodeResult, Recording], None]
 
 
@@ -78,6 +85,9 @@ class EvaluationConfig:
         env_kwargs: arguments of the environment that differ from those of the demonstrations; held
             as JSON holds them. ``people`` is ``test`` after demonstrations of ``train`` people.
         corruption: of the observations, where it is not the one of the training; None otherwise.
+        mouth_source: of the observations, see `ObservationSpec`; a camera takes the place of every
+            corruption.
+        camera_latency: of that camera.
         temporal_ensemble: average the predictions of all chunks, whatever the checkpoint says.
         n_action_steps: actions of a chunk to execute before the next one, where it is not the
             number of the checkpoint; None otherwise.
@@ -89,6 +99,7 @@ class EvaluationConfig:
         device: of the network: auto, cpu, cuda or cuda:NUMBER.
         precision: of the network: fp32, or bf16 for the products inside it.
         videos: number of videos, half of them of successes.
+        is_watched: show the episodes in MuJoCo's viewer, one after another, in real time.
 
     Raises:
         RequestError: a value is not valid.
@@ -99,6 +110,8 @@ class EvaluationConfig:
     out: Path | None = None
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     corruption: Corruption | None = None
+    mouth_source: str = "truth"
+    camera_latency: CameraLatency = 1
     temporal_ensemble: bool = False
     n_action_steps: Chunk | None = None
     strategy: str | None = None
@@ -108,6 +121,7 @@ class EvaluationConfig:
     device: str = "auto"
     precision: str = "fp32"
     videos: NonNegativeInt = 0
+    is_watched: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "env_kwargs", as_json(self.env_kwargs))
@@ -125,13 +139,15 @@ class EvaluationConfig:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Return what JSON can hold."""
-        return {
+        """Return what JSON can hold, without ``is_watched``, on which no result depends."""
+        values = {
             **asdict(self),
             "checkpoint": str(self.checkpoint),
             "seeds": [self.seeds.start, self.seeds.stop],
             "out": None if self.out is None else str(self.out),
         }
+        del values["is_watched"]
+        return values
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> EvaluationConfig:
@@ -185,6 +201,14 @@ class EvaluationPlan:
         spec = checkpoint.spec
         if config.corruption is not None:
             spec = replace(spec, corruption=config.corruption.pinned())
+        if config.mouth_source != "truth":
+            perception = {"mouth_source": config.mouth_source, "corruption": Corruption()}
+            spec = replace(spec, **perception, camera_latency=config.camera_latency)
+            if not spec.frames:
+                raise RequestError(
+                    f"mouth_source {spec.mouth_source}: the policy was trained with the preset "
+                    f"'{spec.obs}', which shows no mouth; leave it out"
+                )
         recorded = checkpoint.dataset.get("env_kwargs", {})
         if "motion_library" in config.env_kwargs:  # another file, of other content perhaps
             recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
@@ -195,8 +219,10 @@ class EvaluationPlan:
         env_kwargs = pin_library({**recorded, **config.env_kwargs})
         env = EnvConfig(checkpoint.env, spec, env_kwargs)
         xml_hash = _require_fit(checkpoint, env)
-        if (spec.cameras or config.videos) and (problem := opengl_problem()):
+        if needs_opengl(spec, config.videos) and (problem := opengl_problem()):
             why = "the policy sees images" if spec.cameras else "--video 0 needs no OpenGL"
+            if spec.sees_by_camera:
+                why = "the mouth is found in images"
             raise RequestError(f"{problem} ({why})")
         execution = choose_execution(checkpoint.execution, config)
         return cls(config, checkpoint, env, xml_hash, execution, choose_device(config.device))
@@ -217,6 +243,10 @@ class EvaluationPlan:
     def corruption_suffix(self) -> str:
         """Name of a corruption that is not the one of the training: ``_under_delay3``."""
         corruption = self.env.spec.corruption
+        if self.env.spec.sees_by_camera:
+            latency = self.env.spec.camera_latency
+            is_usual = latency == EvaluationConfig.camera_latency
+            return f"_under_{self.env.spec.mouth_source}" + ("" if is_usual else f"_{latency}")
         if corruption.is_same_as(self.checkpoint.spec.corruption):
             return ""
         return f"_under_{corruption.label or 'truth'}"
@@ -281,7 +311,7 @@ class EvaluationPlan:
             "observation": spec.to_json(),
             "train_seed": checkpoint.train_seed,
             "checkpoint": checkpoint.content_hash,
-            "versions": software_versions("mujoco", "numpy", "robo_manip_baselines", "torch"),
+            "versions": software_versions(*SOFTWARE, *(DETECTOR if spec.sees_by_camera else ())),
             "settings": settings,
         }
         return as_json(origin)
@@ -332,9 +362,13 @@ class EvaluationPlan:
             return
         checkpoint, successes = self.checkpoint, 0
         num_envs, longest = min(self.config.num_envs, len(seeds)), self.env.task.max_episode_steps
+        workers, env = self.config.workers, self.env
+        if self.config.is_watched:  # results do not depend on the mode, and do not record it
+            num_envs, workers = 1, 0
+            env = replace(env, env_kwargs={**env.env_kwargs, "render_mode": "human"})
         with (
             self._one_thread_if_small(),
-            open_envs(self.env, num_envs, self.config.workers) as envs,
+            open_envs(env, num_envs, workers) as envs,
             EpisodeProgress(len(seeds), longest, checkpoint.policy) as progress,
         ):
 
@@ -365,6 +399,11 @@ class EvaluationPlan:
             yield
         finally:
             torch.set_num_threads(before)
+
+
+def needs_opengl(spec: ObservationSpec, videos: int) -> bool:
+    """Return whether anything is drawn: for the policy, for the detector, or for videos."""
+    return bool(spec.cameras or spec.sees_by_camera or videos)
 
 
 def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummary, list[Path]]:
@@ -474,7 +513,15 @@ def _require_fit(checkpoint: Checkpoint, config: EnvConfig) -> str:
     Raises:
         RequestError: naming what the checkpoint has and what the environment has.
     """
-    face = checkpoint.dataset.get("env_kwargs", {}).get("face", "visual")
+    trained_kwargs = checkpoint.dataset.get("env_kwargs", {})
+    for name, (usual, *_) in task_entry(config.env).choices.items():
+        trained, asked = (own.get(name, usual) for own in (trained_kwargs, config.env_kwargs))
+        if trained != asked:
+            raise RequestError(
+                f"checkpoint '{checkpoint.folder}' was trained with {name} {trained}, not {asked}; "
+                "leave the option as trained, or train another policy"
+            )
+    face = trained_kwargs.get("face", "visual")
     own = here = _facts_of_model(config)
     if here["face"] != face:
         own = _facts_of_model(config, face=face)

@@ -86,6 +86,8 @@ class EpisodeResult:
         motion: of the face by name, see `parse_motion`
         safety: see `EpisodeSafety`; null in rows of earlier releases
         columns: columns of the task, see its entry
+        frames_without_detection: images in which no face was found; null where the mouth does not
+            come from a camera, and left out of the row then
         policy: name of the policy
         condition: name of the experimental condition, for example current_pred_h2
         observation: spec of what the policy was shown, as JSON; null in rows of version 1
@@ -110,6 +112,7 @@ class EpisodeResult:
     motion: str = "recorded"
     safety: EpisodeSafety | None = None
     columns: dict[str, Any] = field(default_factory=dict)
+    frames_without_detection: NonNegativeInt | None = None
     policy: str = ""
     condition: str = ""
     observation: dict[str, Any] | None = None
@@ -127,6 +130,8 @@ class EpisodeResult:
         """Return the row as one line of JSON, without the line's end."""
         values = asdict(self)
         columns = values.pop("columns")
+        if values["frames_without_detection"] is None:
+            del values["frames_without_detection"]
         return json.dumps({"version": ROW_VERSION, **values, **columns}, allow_nan=False)
 
     @classmethod
@@ -143,6 +148,7 @@ class EpisodeResult:
                 f"{source}: version {shown(version)}; this release reads 1 to {ROW_VERSION}"
             )
         values.setdefault("safety", None)
+        values.setdefault("frames_without_detection", None)
         if version < 3:
             values.setdefault("settings", None)
             values.setdefault("motion", "recorded")

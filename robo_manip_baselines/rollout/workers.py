@@ -174,6 +174,7 @@ class LocalEnvs:
                     motion_subject=world.segment.subject,
                     motion=str(world.motion),
                     columns=columns,
+                    frames_without_detection=world.frames_without_detection,
                     safety=self._safety[number].result(info),
                 )
                 return StepResult(number, result)

@@ -1,6 +1,6 @@
 """Training batches: sampled, and made ahead by threads in main memory or on a CUDA device.
 
-Examples and noise of each step are functions of the seed and of the step, nothing else.
+Examples, noise and changes to images are functions of the seed and of the step, nothing else.
 
 Legend: E training episodes, R steps of them, b examples of a step, O observation steps, S elements
 of the state, A elements of an action, K actions of a chunk, N cameras, H and W image height and
@@ -30,6 +30,11 @@ from robo_manip_baselines.policy.presets import SAMPLERS, TrainSettings
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.ranges import Count, NonNegativeInt, require_range
 from robo_manip_baselines.runs.seeds import derive_seed
+from robo_manip_baselines.training.augmentation import (
+    ImageAugmentation,
+    ImageChanges,
+    change_images,
+)
 from robo_manip_baselines.training.images import ImageStore
 
 UPLOAD = 64
@@ -223,6 +228,7 @@ class BatchLoader:
         action_noise: standard deviation of the noise that is added to normalised actions.
         intervention_weight: of the error of actions that a person chose instead of the policy.
         images: None without cameras. Not closed by the loader.
+        augment: random changes to the images; None for none.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
     Raises:
@@ -248,6 +254,7 @@ class BatchLoader:
         action_noise: float = 0.0,
         intervention_weight: float = 1.0,
         images: ImageStore | None = None,
+        augment: ImageAugmentation | None = None,
         depth: int = 4,
     ) -> None:
         if not np.array_equal(demonstrations.lengths[list(episodes)], sampler.lengths):
@@ -284,6 +291,7 @@ class BatchLoader:
             marked = demonstrations.intervention[self._rows]
             self._weight = np.where(marked, intervention_weight, 1.0).astype(np.float32)
         self._images = images
+        self._augmentation = augment
         self._device = torch.device(device)
         self._stream: torch.cuda.Stream | None = None
         self._device_images: Tensor | None = None
@@ -333,6 +341,9 @@ class BatchLoader:
         if self._state_noise:
             drawn = self._state_noise.draw(self._seed, step, count * n_obs_steps)
             state_noise = None if drawn is None else drawn.view(count, n_obs_steps, -1)[part]
+        image_changes: ImageChanges | None = None
+        if self._augmentation:
+            image_changes = self._augmentation.draw(self._seed, step, count).part(part)
         gather = self._gather if self._stream is None else self._gather_on_device
         # All processes divide by the same number, the mean over the processes.
         return gather(
@@ -340,6 +351,7 @@ class BatchLoader:
             chunks[part],
             state_noise,
             self._action_change(step, part, windows[part, -1], state_noise),
+            image_changes,
             is_pad=torch.from_numpy(is_pad[part]),
             noise=noise[part],
             num_valid=torch.tensor(float((~is_pad).sum()) / self._world_size),
@@ -385,6 +397,7 @@ class BatchLoader:
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
         change: Tensor | None,
+        image_changes: ImageChanges | None,
         **others: Tensor,
     ) -> tuple[Batch, None]:
         """Gather rows in main memory.
@@ -396,6 +409,8 @@ class BatchLoader:
         if state_noise is not None:
             state += state_noise
         images = None if self._images is None else torch.from_numpy(self._read_images(windows))
+        if images is not None and image_changes is not None:
+            images = change_images(images, image_changes)
         action = torch.from_numpy(self._action[chunks])
         if change is not None:
             action += change
@@ -407,6 +422,7 @@ class BatchLoader:
         chunks: NDArray[np.int64],
         state_noise: Tensor | None,
         change: Tensor | None,
+        image_changes: ImageChanges | None,
         **others: Tensor,
     ) -> tuple[Batch, torch.cuda.Event]:
         """Gather rows on the device, without waiting for it."""
@@ -424,6 +440,8 @@ class BatchLoader:
             images = None if self._device_images is None else self._device_images[rows]
             if host_images is not None:
                 images = host_images.to(self._device, non_blocking=True)
+            if images is not None and image_changes is not None:
+                images = change_images(images, image_changes.to(self._device))
             state = self._device_state[rows]
             if state_noise is not None:
                 state += copied(state_noise)

@@ -31,6 +31,7 @@ from robo_manip_baselines.runs.interrupt import StopRequest
 from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_curves
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import derive_seed
+from robo_manip_baselines.training.augmentation import ImageAugmentation
 from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise
 from robo_manip_baselines.training.config import CURVES, METRICS, RUN, TrainConfig
 from robo_manip_baselines.training.device import (
@@ -229,6 +230,10 @@ class Trainer:
         )
         names = task_entry(config.env).names
         noise = StateNoise(given.spec, names, settings.state_noise, settings.clock_noise)
+        augment: ImageAugmentation | None = None
+        if images is not None and settings.augment != "none":
+            changes = settings.augment, images.shape, settings.augment_shift
+            augment = ImageAugmentation(*changes)
         episodes = given.indices(setup.split.train)
         self.loader = BatchLoader(
             *(given, setup.normalization, episodes, setup.sampler, model),
@@ -242,6 +247,7 @@ class Trainer:
             action_noise=settings.action_noise,
             intervention_weight=settings.intervention_weight,
             images=images,
+            augment=augment,
         )
         self.held_out: HeldOutLoss | None = None
         if setup.split.validation and processes.is_main:

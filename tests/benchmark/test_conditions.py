@@ -83,6 +83,7 @@ def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> No
 def test_the_conditions_of_the_presets_are_there() -> None:
     file = read_conditions(CONDITIONS / "feeding.yaml")
     assert {name: len(file.choose(names)) for name, names in file.presets.items()} == {
+        "cpu_images": 4,
         "paper": 12,
         "smoke": 3,
     }

@@ -247,7 +247,7 @@ INFO: dict[str, Any] = {
     "phase": "reach",
     "face_force": 0.0,
     "mouth_position": np.zeros(3),
-    "gripper_position": np.zeros(3),
+    "utensil_position": np.zeros(3),
     "cube_offset": np.zeros(3),
     "time_since_lift": None,
     "handover_time": None,
@@ -262,12 +262,12 @@ INFO: dict[str, Any] = {
         ([{"phase": "pass", "time_since_lift": 3.0}], "not_handed_over", None),
         ([{"phase": "release", "time_since_lift": 3.0}], "dropped", None),
         (
-            [{"phase": "carry", "gripper_position": np.array([0.2, 0.0, 0.0])}, {}],
+            [{"phase": "carry", "utensil_position": np.array([0.2, 0.0, 0.0])}, {}],
             "too_late",
             2.0,
         ),
         (
-            [{"phase": "carry", "gripper_position": np.array([0.0, 0.0, 0.03])}, {}],
+            [{"phase": "carry", "utensil_position": np.array([0.0, 0.0, 0.03])}, {}],
             "missed_high",
             2.0,
         ),

@@ -63,7 +63,7 @@ def info(phase: str, gripper: tuple[float, float, float], **changes: object) -> 
     """The mouth is at (0, 0.5, 0.35)."""
     return {
         "phase": phase,
-        "gripper_position": np.array(gripper),
+        "utensil_position": np.array(gripper),
         "mouth_position": np.array([0.0, 0.5, 0.35]),
         "cube_offset": np.array(gripper) - [0.012, 0.5, 0.35],  # ahead of the gripper
         "face_force": 0.0,

@@ -28,6 +28,9 @@ class FakeViewer:
     def close(self) -> None:
         self.is_closed = True
 
+    def is_running(self) -> bool:
+        return not self.is_closed
+
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[FakeViewer]:
@@ -60,6 +63,28 @@ def test_one_viewer_shows_every_step_until_it_is_closed(opened: list[FakeViewer]
     assert len(opened) == 1
     env.close()
     assert viewer.is_closed
+
+
+def test_steps_are_shown_no_faster_than_in_life(
+    opened: list[FakeViewer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, slept = [50.0], []
+
+    def sleep(seconds: float) -> None:
+        slept.append(round(seconds, 6))
+        now[0] += seconds
+
+    monkeypatch.setattr(face_env, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    env = make_env("FeedingEnv", cameras=(), render_mode="human")
+    env.reset(seed=0)
+    for taken in (0.005, 0.05, 0.015):  # of a step, the second one too long
+        now[0] += taken
+        env.step(env.action_space.sample())
+    assert slept == [0.0, 0.015, 0.0, 0.005]
+    opened[0].close()  # by the person
+    env.step(env.action_space.sample())
+    assert len(slept) == 4
+    env.close()
 
 
 def test_no_viewer_without_being_asked_for(opened: list[FakeViewer]) -> None:

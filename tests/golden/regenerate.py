@@ -59,6 +59,10 @@ WATCHED = (
     "vision.backbone.layer4.1.conv2.weight",
     "vision.projection.weight",
     "vision.cameras",
+    "small_vision.backbone.convolutions.0.0.weight",
+    "small_vision.backbone.convolutions.1.6.weight",
+    "small_vision.backbone.projections.1.0.weight",
+    "state_projection.0.weight",
     "encoder.layers.0.attention.query.weight",
     "decoder.layers.0.memory_attention.key.weight",
     "decoder.layers.2.feed_forward.narrow.weight",
@@ -101,9 +105,22 @@ def fixed_batch(has_images: bool) -> Batch:
     )
 
 
-def act_step(paper_compat: bool) -> dict[str, Any]:
+ACT_SETTINGS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper_compat": {"paper_compat": True},
+    "small_vision": {
+        "vision": "small",
+        "camera_features": 6,
+        "state_layers": 1,
+        "use_cvae": False,
+        "actions_per_query": 3,
+    },
+}
+
+
+def act_step(name: str) -> dict[str, Any]:
     """Return `training_step` of ACT."""
-    model = ActModel(ActConfig(**CONFIG, paper_compat=paper_compat), DIMS)
+    model = ActModel(ActConfig(**{**CONFIG, **ACT_SETTINGS[name]}), DIMS)
     return training_step(model, fixed_batch(has_images=True), WATCHED)
 
 
@@ -236,11 +253,7 @@ def face_step(name: str) -> dict[str, Any]:
 def main() -> None:
     """Write every golden file."""
     write_json(FACE_STEP, {name: face_step(name) for name in FACE_SETTINGS})
-    golden = {
-        "default": act_step(paper_compat=False),
-        "paper_compat": act_step(paper_compat=True),
-    }
-    write_json(ACT_STEP, golden)
+    write_json(ACT_STEP, {name: act_step(name) for name in ACT_SETTINGS})
     write_json(MLP_STEP, mlp_step())
     write_json(SARNN_STEP, sarnn_step())
     write_json(DENOISING_STEP, {f"{p} {b}": denoising_step(p, b) for p, b in DENOISING_STEPS})

@@ -26,7 +26,7 @@ def numbers(tree: dict[str, Any], prefix: str = "") -> dict[str, float]:
     return flat
 
 
-@pytest.mark.parametrize("step", ["default", "paper_compat", "mlp", "sarnn"])
+@pytest.mark.parametrize("step", ["default", "paper_compat", "small_vision", "mlp", "sarnn"])
 def test_a_training_step(repository: Path, step: str) -> None:
     golden = runpy.run_path(str(repository / "tests" / "golden" / "regenerate.py"))
     if step in ("mlp", "sarnn"):
@@ -34,7 +34,7 @@ def test_a_training_step(repository: Path, step: str) -> None:
         expected, found = json.loads(file.read_text()), golden[f"{step}_step"]()
     else:
         expected = json.loads(golden["ACT_STEP"].read_text())[step]
-        found = golden["act_step"](paper_compat=step == "paper_compat")
+        found = golden["act_step"](step)
     expected, found = numbers(expected), numbers(found)
     assert found.keys() == expected.keys()
     assert found == pytest.approx(expected, rel=TOLERANCE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from robo_manip_baselines.data.normalization import Normalization, mean_std
 from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.training.augmentation import ImageAugmentation, change_images
 from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise, part_of
 from robo_manip_baselines.training.images import ImageStore
 
@@ -201,6 +202,25 @@ def test_windows_end_with_the_example_and_begin_in_its_episode(
                 np.testing.assert_array_equal(batch.images[i].numpy(), images.images(rows))
             drawn = noisy.batch(step).state - batch.state
             assert len(torch.unique(drawn[..., :14])) > 0.9 * drawn[..., :14].numel()
+
+
+def test_images_are_changed_for_training_only_where_asked(shown: Demonstrations) -> None:
+    with ImageStore(shown) as images:
+        augment = ImageAugmentation("shift+colour", images.shape, 0.1)
+        plain = make_loader(shown, images=images)
+        changed = make_loader(shown, images=images, augment=augment)
+        parts = [
+            make_loader(shown, images=images, augment=augment, rank=rank, world_size=2)
+            for rank in range(2)
+        ]
+        for step in range(3):
+            before = plain.batch(step)
+            assert before.images is not None
+            expected = change_images(before.images, augment.draw(5, step, 4))
+            assert not torch.equal(expected, before.images)
+            assert_equal(changed.batch(step), replace(before, images=expected))
+            joined = [part.batch(step).images for part in parts]
+            assert torch.equal(torch.cat([x for x in joined if x is not None]), expected)
 
 
 def loading_threads() -> list[str]:

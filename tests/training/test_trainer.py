@@ -16,7 +16,6 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from robo_manip_baselines.commands.train import parse_config
-from robo_manip_baselines.policy.act import resnet as backbone
 from robo_manip_baselines.policy.checkpoint import load_model, read_checkpoint
 from robo_manip_baselines.policy.interface import Batch
 from robo_manip_baselines.policy.mlp.model import MlpModel
@@ -41,7 +40,7 @@ PLAIN = f"{MLP} --validation_fraction 0.2 --warmup_steps 0 --ema_decay 0"
 ACT = (
     "Act --preset cpu --chunk_size 3 --hidden_size 8 --feedforward_size 8 --num_heads 2 "
     "--encoder_layers 1 --decoder_layers 1 --use_cvae --cvae_layers 1 --batch_size 4 "
-    "--validation_fraction 0.2"
+    "--validation_fraction 0.2 --backbone_width 8"
 )
 FLOW = (
     "Flow --preset cpu --chunk_size 4 --hidden_size 16 --num_layers 1 --batch_size 4 "
@@ -59,14 +58,12 @@ RUNS = {
         f"{ACT} --cameras angle top --image_size 24x32 --dropout 0.1 --batch_size 2 "
         "--precision fp32"
     ),
+    "changed images": (
+        f"{ACT} --cameras angle top --image_size 24x32 --batch_size 2 --vision small "
+        "--camera_features 4 --augment shift+colour --precision fp32"
+    ),
     "nothing held out": f"{MLP} --validation_fraction 0",
 }
-
-
-@pytest.fixture(autouse=True)
-def narrow_backbone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ResNet-18 of a thousandth of the size."""
-    monkeypatch.setattr(backbone, "WIDTHS", (8, 8, 8, 8))
 
 
 def configure(line: str, episodes: Path, out: Path) -> TrainConfig[Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Interval
 
@@ -51,6 +51,11 @@ class ActConfig:
         dropout: on the residual branches and inside the feed-forward blocks in training (public
             ACT: 0.1). Attention weights are not dropped: that would need them in memory.
         pre_norm: layer normalisation before each block instead of after it (public ACT: False).
+        vision: features of the images: resnet18, one for all cameras, whose feature maps are tokens
+            (public ACT); or small, four convolutions for each camera and a linear layer, whose
+            features are observed beside the state: a twentieth of a ResNet's work.
+        backbone_width: channels of the first stage of the ResNet-18 (He et al. 2016: 64).
+        camera_features: of each camera with ``vision`` small.
         backbone_learning_rate_factor: learning rate of the ResNet-18 as a multiple of the others'
             (public ACT: 1e-5 for both, so 1); 0 keeps it as it is.
         backbone_weights: file with the state dict of a torchvision ResNet-18 to start from,
@@ -78,12 +83,18 @@ class ActConfig:
     kl_weight: Amount = 10.0
     dropout: Fraction = 0.1
     pre_norm: bool = False
+    vision: Literal["resnet18", "small"] = "resnet18"
+    backbone_width: Annotated[int, Interval(ge=1, le=1024)] = 64
+    camera_features: Width = 64
     backbone_learning_rate_factor: Amount = 1.0
     backbone_weights: str | None = None
     paper_compat: bool = False
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        if self.backbone_width % 8:
+            # With fewer, oneDNN of PyTorch 2.13 corrupts memory on processors with AVX2 alone.
+            raise RequestError(f"backbone_width {self.backbone_width}: must be a multiple of 8")
         for divisor, why in ((4, "4"), (self.num_heads, f"num_heads {self.num_heads}")):
             if self.hidden_size % divisor:
                 raise RequestError(f"hidden_size {self.hidden_size}: must be a multiple of {why}")
@@ -101,8 +112,14 @@ class ActConfig:
         count = layers * (attention + blocks) + self.decoder_layers * (2 * attention + blocks)
         if self.state_layers:
             count += (self.state_layers - 1) * forward**2 + forward * (dims.state + width)
-        if dims.cameras:
-            count += RESNET18_PARAMETERS
+        if dims.cameras and self.vision == "resnet18":
+            count += RESNET18_PARAMETERS * self.backbone_width**2 // 64**2
+            count += 8 * self.backbone_width * width
+        elif dims.cameras:
+            cells = 48 * dims.image[0] * dims.image[1] // 16**2
+            each = 64_680 + cells * self.camera_features  # four convolutions and a linear layer
+            beside = forward if self.state_layers else width
+            count += dims.cameras * (each + self.camera_features * beside)
         ends = 2 * self.latent_size + dims.state + dims.action * self.actions_per_query
         return count + width * (self.num_queries + ends)
 
@@ -135,10 +152,12 @@ PRESETS = {
         object_pose=True,
     ),
     "cpu_images": PolicyPreset(
-        config=_SMALL,
-        training=replace(STATE_ONLY_TRAINING, batch_size=16, steps=3000),
-        execution=ActionExecution(temporal_ensemble=False, n_action_steps=8),
-        cameras=("angle", "front_close"),
-        image_size=(60, 80),
+        config=replace(_SMALL, vision="small"),
+        training=replace(
+            STATE_ONLY_TRAINING, batch_size=16, steps=6000, augment="shift", augment_shift=0.02
+        ),
+        # Images are drawn and encoded for every tenth step only.
+        execution=ActionExecution(temporal_ensemble=False, n_action_steps=10),
+        image_size=(96, 128),
     ),
 }

@@ -13,6 +13,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from robo_manip_baselines.policy.act.cameras import CameraEncoder
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.resnet import (
     ResNet18,
@@ -336,10 +337,13 @@ class ActModel(PolicyModel):
         self.noise_size = config.latent_size if config.use_cvae else 0
         self.cvae = CvaeEncoder(config, dims) if config.use_cvae else None
         self.latent_projection = ExactLinear(config.latent_size, width)
-        self.state_projection = _state_projection(config, dims)
+        is_small = bool(dims.cameras) and config.vision == "small"
+        self.small_vision = SmallVision(config, dims) if is_small else None
+        seen = config.camera_features * dims.cameras if is_small else 0
+        self.state_projection = _state_projection(config, dims.state + seen)
         # Learned positions of latent and state, of unit variance like those of the sines.
         self.token_positions = nn.Parameter(torch.randn(2, width))
-        self.vision = Vision(config, dims) if dims.cameras else None
+        self.vision = Vision(config, dims) if dims.cameras and not is_small else None
         self.encoder = Encoder(config, config.encoder_layers)
         self.queries = nn.Parameter(torch.randn(config.num_queries, width))
         num_run = 1 if config.paper_compat else config.decoder_layers
@@ -391,7 +395,8 @@ class ActModel(PolicyModel):
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, object]]:
         """Return two groups: everything else, and the backbone with its own learning rate."""
-        backbone = list(self.vision.backbone.parameters()) if self.vision is not None else []
+        vision = self.vision or self.small_vision
+        backbone = list(vision.backbone.parameters()) if vision is not None else []
         inside = {id(parameter) for parameter in backbone}
         trained = [p for p in self.parameters() if p.requires_grad and id(p) not in inside]
         slow = [p for p in backbone if p.requires_grad]
@@ -402,6 +407,8 @@ class ActModel(PolicyModel):
     def _actions(self, state: Tensor, images: Tensor | None, latent: Tensor | None) -> Tensor:
         """(B, K, A) float32 from (B, 1, S), (B, 1, N, H, W, 3) and (B, Z), None being 0."""
         state = state[:, -1]
+        if self.small_vision is not None:
+            state = torch.cat([state, self.small_vision(images)], dim=1)
         if latent is None:
             latent = state.new_zeros((state.shape[0], self.config.latent_size))
         tokens = [self.latent_projection(latent)[:, None], self.state_projection(state)[:, None]]
@@ -417,10 +424,10 @@ class ActModel(PolicyModel):
         return actions[:, : self.chunk_size]
 
 
-def _state_projection(config: ActConfig, dims: PolicyDims) -> nn.Module:
-    """Build the layers from the state (B, S) to its token (B, D)."""
+def _state_projection(config: ActConfig, size: int) -> nn.Module:
+    """Build the layers from the state and what is seen (B, size) to their token (B, D)."""
     layers: list[nn.Module] = []
-    size, hidden = dims.state, config.feedforward_size
+    hidden = config.feedforward_size
     for _ in range(config.state_layers):
         layers += [ExactLinear(size, hidden), nn.LayerNorm(hidden), nn.GELU()]
         size = hidden
@@ -436,7 +443,7 @@ class Vision(nn.Module):
     def __init__(self, config: ActConfig, dims: PolicyDims) -> None:
         super().__init__()
         self.shape = (dims.cameras, *dims.image, 3)
-        self.backbone = ResNet18()
+        self.backbone = ResNet18(config.backbone_width)
         if config.backbone_learning_rate_factor == 0.0:
             self.backbone.requires_grad_(False)
         self.projection = nn.Conv2d(self.backbone.features, config.hidden_size, 1)
@@ -452,12 +459,36 @@ class Vision(nn.Module):
         Raises:
             ValueError: the images are not (B, 1, N, H, W, 3).
         """
-        given = None if images is None else tuple(images.shape[2:])
-        if images is None or given != self.shape:
-            raise ValueError(f"images of {self.shape} are needed for each example, not {given}")
-        images = images[:, -1]
+        images = _present(images, self.shape)
         # One pass over the images of all cameras and examples.
         features = self.projection(self.backbone(images.flatten(0, 1)))
         tokens = features.flatten(2).transpose(1, 2).unflatten(0, images.shape[:2]).flatten(1, 2)
         positions = self.positions if self.cameras is None else self.positions + self.cameras
         return tokens.float(), positions.flatten(0, 1)
+
+
+class SmallVision(nn.Module):
+    """Features of the images of all cameras, to be observed beside the state."""
+
+    def __init__(self, config: ActConfig, dims: PolicyDims) -> None:
+        super().__init__()
+        self.shape = (dims.cameras, *dims.image, 3)
+        self.backbone = CameraEncoder(dims.cameras, config.camera_features, dims.image)
+        if config.backbone_learning_rate_factor == 0.0:
+            self.backbone.requires_grad_(False)
+
+    def forward(self, images: Tensor | None) -> Tensor:
+        """Return (B, N F) float32, F being ``camera_features``.
+
+        Raises:
+            ValueError: the images are not (B, 1, N, H, W, 3).
+        """
+        return self.backbone(_present(images, self.shape))
+
+
+def _present(images: Tensor | None, shape: tuple[int, ...]) -> Tensor:
+    """Return the images (B, N, H, W, 3) of the present step; raise ValueError for other shapes."""
+    given = None if images is None else tuple(images.shape[2:])
+    if images is None or given != shape:
+        raise ValueError(f"images of {shape} are needed for each example, not {given}")
+    return images[:, -1]

@@ -18,8 +18,10 @@ from robo_manip_baselines.runs.tensors import read_tensors, require_finite
 STRIDE = 32
 """Pixels of the image to a cell of the last feature map."""
 
-WIDTHS = (64, 128, 256, 512)
-"""Channels of the feature maps of the four stages; the last one's are its features."""
+WIDTH = 64
+"""Channels of the first of the four stages (He et al. 2016); each later one has twice as many."""
+
+STAGES = 4
 
 # Mean and standard deviation of ImageNet's colours from 0 to 1, with which torchvision's weights
 # were trained; public ACT uses them too.
@@ -101,19 +103,23 @@ class ResNet18(nn.Module):
     statistics the sum of a block and its shortcut doubles the variance, but each strided stage
     halves it, so that activations grow fivefold over the whole network and need no other remedy.
 
+    Args:
+        width: channels of the first stage.
+
     Attributes:
-        features: channels of the feature map.
+        features: F, channels of the feature map, eight times ``width``.
     """
 
     mean: Tensor
     scale: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, width: int = WIDTH) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(3, WIDTHS[0], 7, 2, 3, bias=False)
-        self.bn1 = FrozenBatchNorm(WIDTHS[0])
-        channels_in = WIDTHS[0]
-        for stage, channels_out in enumerate(WIDTHS, start=1):
+        self.conv1 = nn.Conv2d(3, width, 7, 2, 3, bias=False)
+        self.bn1 = FrozenBatchNorm(width)
+        channels_in = width
+        for stage in range(1, STAGES + 1):
+            channels_out = width << (stage - 1)
             first = BasicBlock(channels_in, channels_out, 1 if stage == 1 else 2)
             second = BasicBlock(channels_out, channels_out, 1)
             self.add_module(f"layer{stage}", nn.Sequential(first, second))
@@ -127,13 +133,13 @@ class ResNet18(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return (I, 512, h, w) for (I, H, W, 3) uint8 images."""
+        """Return (I, F, h, w) for (I, H, W, 3) uint8 images."""
         # (H, W, 3) images seen as (3, H, W) are in the channels-last order already.
         x = (images.permute(0, 3, 1, 2) - self.mean) * self.scale
         x = convolve(x.to(self.conv1.weight.dtype), self.conv1, self.bn1)
         # Rectifying after the maximum gives the same numbers and has a quarter of them to do.
         x = nn.functional.relu(nn.functional.max_pool2d(x, 3, 2, 1), inplace=True)
-        for stage in range(1, len(WIDTHS) + 1):
+        for stage in range(1, STAGES + 1):
             x = self.get_submodule(f"layer{stage}")(x)
         return x
 

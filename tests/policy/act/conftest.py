@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from robo_manip_baselines.policy.act import resnet as backbone
 from robo_manip_baselines.policy.act.config import ActConfig
 from robo_manip_baselines.policy.act.model import ActModel
 from robo_manip_baselines.policy.interface import Batch, PolicyDims
@@ -24,16 +23,14 @@ CONFIG = ActConfig(
     latent_size=4,
     cvae_layers=2,
     dropout=0.0,
+    backbone_width=8,  # 11 million weights take long to draw
 )
 DIMS = PolicyDims(state=5, action=3, cameras=2, image=(40, 70))
 
 
 @pytest.fixture
-def make_model(monkeypatch: pytest.MonkeyPatch) -> Callable[..., ActModel]:
+def make_model() -> Callable[..., ActModel]:
     """Build a tiny network with the same weights for the same settings."""
-    # All the blocks, few of the channels: 11 million weights take long to draw.
-    # Multiples of 8: with fewer, oneDNN of PyTorch 2.13 corrupts memory on AVX2 processors.
-    monkeypatch.setattr(backbone, "WIDTHS", (8, 8, 8, 16))
 
     def make(dims: PolicyDims = DIMS, **settings: Any) -> ActModel:
         with torch.random.fork_rng(devices=[]):

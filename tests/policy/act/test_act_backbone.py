@@ -140,6 +140,16 @@ def test_the_size_of_the_feature_map_is_known_beforehand(net: ResNet18, height: 
     assert tuple(features.shape[1:]) == (512, *feature_size((height, width)))
 
 
+def test_a_narrow_network_has_fewer_channels_in_every_stage():
+    narrow = ResNet18(16)
+    assert narrow.features == 128
+    shapes = torchvision_shapes()
+    for name, value in narrow.state_dict().items():
+        expected = [size if size in (3, 7, 1) else size // 4 for size in shapes[name]]
+        assert list(value.shape) == expected, name
+    assert narrow(draw_images(1, 33, 20)).shape == (1, 128, 2, 1)
+
+
 def test_images_are_worked_on_in_the_order_they_come_in(net: ResNet18):
     assert net(draw_images(2, 64, 64)).is_contiguous(memory_format=torch.channels_last)
 

@@ -33,6 +33,8 @@ def test_the_defaults_are_those_of_table_three_and_of_the_public_code():
         ({"hidden_size": 510, "num_heads": 2}, "hidden_size 510: must be a multiple of 4"),
         ({"num_heads": 7}, "hidden_size 512: must be a multiple of num_heads 7"),
         ({"actions_per_query": 0}, "actions_per_query 0: must be 1 to 10000"),
+        ({"backbone_width": 12}, "backbone_width 12: must be a multiple of 8"),
+        ({"camera_features": 0}, "camera_features 0: must be 1 to 65536"),
         ({"dropout": 1.0}, "dropout 1.0: must be 0 or more, less than 1"),
         ({"dropout": -0.1}, "dropout -0.1: must be 0 or more, less than 1"),
         ({"kl_weight": -1.0}, "kl_weight -1.0: must be 0 or more, and finite"),

@@ -35,6 +35,14 @@ BLIND = PolicyDims(state=5, action=3, cameras=0, image=(40, 70))
         (PolicyDims(14, 7, 3, (480, 640)), {"paper_compat": True}, 83_915_399, 51_606_407),
         (PolicyDims(29, 7, 3, (480, 640)), {"paper_compat": True}, 83_930_759, 51_621_767),
         (PolicyDims(14, 7, 3, (480, 640)), {"use_cvae": False}, 66_539_079, 66_539_079),
+        (
+            PolicyDims(14, 7, 3, (480, 640)),
+            {"backbone_width": 16},
+            # 11,166,912 weights of a ResNet-18 become 699,696, and 384 features of it less are
+            # projected to 512.
+            83_916_935 - 11_166_912 + 699_696 - 384 * 512,
+            83_916_935 - 11_166_912 + 699_696 - 384 * 512,
+        ),
         # 90 queries of 512 less, and 9 × 7 more outputs of 512 + 1 weights.
         (PolicyDims(14, 7, 3, (480, 640)), {"actions_per_query": 10}, 83_903_174, 83_903_174),
     ],
@@ -256,7 +264,9 @@ class Recorder(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("settings", [{"dropout": 0.1}, {"paper_compat": True}])
+@pytest.mark.parametrize(
+    "settings", [{"dropout": 0.1}, {"paper_compat": True}, {"vision": "small"}]
+)
 @pytest.mark.parametrize("cameras", [0, 2])
 def test_a_step_waits_for_no_number(make_model, make_batch, cameras: int, settings: dict[str, Any]):
     # On a GPU each of these would halt the queue until what came before is done.
@@ -305,7 +315,7 @@ def test_what_is_saved_builds_the_same_network(make_model, make_batch):
 @pytest.mark.long
 def test_it_starts_from_given_weights(make_model, tmp_path):
     path = tmp_path / "resnet18.safetensors"
-    state = ResNet18().state_dict()
+    state = ResNet18(8).state_dict()
     save_file(state, path)
     model = make_model(backbone_weights=str(path))
     loaded = model.vision.backbone.state_dict()

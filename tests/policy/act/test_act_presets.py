@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
+import torch
+
 from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.policy.act.config import PRESETS
+from robo_manip_baselines.policy.act.model import ActModel
+from robo_manip_baselines.policy.interface import PolicyDims
 from robo_manip_baselines.training.batching import ExampleSampler
 
 
@@ -31,8 +38,14 @@ def test_cpu_sees_no_images() -> None:
     assert preset.object_pose
 
 
-def test_cpu_images_is_as_small_and_sees_two_cameras() -> None:
+def test_cpu_images_sees_three_cameras_through_small_encoders() -> None:
     preset = PRESETS["cpu_images"]
-    assert preset.config == PRESETS["cpu"].config
-    assert (preset.cameras, preset.image_size) == (("angle", "front_close"), (60, 80))
-    assert not preset.object_pose
+    assert (preset.cameras, preset.image_size, preset.object_pose) == (CAMERAS, (96, 128), False)
+    assert preset.config == replace(PRESETS["cpu"].config, vision="small")
+    assert (preset.training.augment, preset.training.augment_shift) == ("shift", 0.02)
+    with torch.device("meta"):
+        dims = PolicyDims(29, 7, len(preset.cameras), preset.image_size)
+        model = ActModel(preset.config, dims)
+    count = sum(parameter.numel() for parameter in model.parameters())
+    assert count == 1_134_811  # of which docs/act.md speaks
+    assert preset.config.num_parameters(dims) == pytest.approx(count, rel=0.05)

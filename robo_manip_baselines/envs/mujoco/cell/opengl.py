@@ -67,6 +67,20 @@ def viewer_problem() -> str | None:
     return None if probe.returncode == 0 else "no window can be opened on the display"
 
 
+def require_viewer(option: str = "--view") -> None:
+    """Require that MuJoCo's viewer can open a window.
+
+    Raises:
+        RequestError: it cannot, and why.
+    """
+    from robo_manip_baselines.runs.errors import RequestError  # this file is also a script
+
+    if problem := viewer_problem():
+        raise RequestError(
+            f"{option}: {problem}; leave it out, or write a video (--video, or the preview)"
+        )
+
+
 def apt_line(backend: str) -> str:
     """Return the command that installs ``backend`` on Debian and Ubuntu."""
     sudo = "" if os.geteuid() == 0 else "sudo "

@@ -102,6 +102,18 @@ class CameraRenderer:
             images = self._target.draw(self.model, data, numbers)
         return dict(zip(cameras, images, strict=True))
 
+    def render_depth(self, data: mujoco.MjData, camera: str) -> NDArray[np.float32]:
+        """Return the distances (H, W) m, along the view, of what ``camera`` sees.
+
+        See `render`.
+        """
+        number = self._cameras[require_choice("camera", camera, self._cameras)]
+        if self._target is None:
+            self._target = _Target(self)
+            _open_renderers.add(self)
+        with self._target.current():
+            return self._target.draw_depth(self.model, data, number)
+
     def close(self) -> None:
         """Free the OpenGL context, if there is one. Rendering again would make a new one."""
         if self._target is not None:
@@ -177,6 +189,21 @@ class _Target:
             mujoco.mjr_readPixels(self._upside_down, None, self._rect, self._context)
             images.append(self._upside_down[::-1].copy())  # OpenGL's first row is the lowest
         return images
+
+    def draw_depth(
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: int
+    ) -> NDArray[np.float32]:
+        """Return the distances (H, W) m along the view of a camera number."""
+        self._camera.fixedcamid = camera
+        scene = (self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
+        mujoco.mjv_updateScene(model, data, self._option, None, *scene)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        height, width, _ = self._upside_down.shape
+        buffer = np.empty((height, width), np.float32)
+        mujoco.mjr_readPixels(None, buffer, self._rect, self._context)
+        near, far = model.stat.extent * np.array([model.vis.map.znear, model.vis.map.zfar])
+        # The buffer goes from 0 at the near plane to 1 at the far one, linear in 1 / distance.
+        return (near / (1.0 - buffer[::-1] * (1.0 - near / far))).astype(np.float32)
 
     def free(self) -> None:
         """Free the OpenGL resources, unless they are those of the process we were forked from."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import mink
 import numpy as np
@@ -275,11 +275,28 @@ class PhasedExpert:
 
     Args:
         arm: ``left`` or ``right``.
-        home: (6,) rad, joints with which an episode starts, the fingers open.
+        home: (6,) rad, joints with which an episode starts.
+        finger: m, position of a finger then.
+        tool: frame that commands place, in that of the gripper, such as a spoon's; None for the
+            gripper itself.
+
+    Attributes:
+        goes_by_observation: whether it sees the mouth as the environment observes it; others know
+            the truth.
     """
 
-    def __init__(self, arm: str = "right", home: Sequence[float] = HOME_QPOS) -> None:
-        self._kinematics, self._start = ArmKinematics(arm), home
+    goes_by_observation: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        arm: str = "right",
+        home: Sequence[float] = HOME_QPOS,
+        *,
+        finger: float = FINGER_OPEN,
+        tool: mink.SE3 | None = None,
+    ) -> None:
+        self._kinematics, self._start, self._finger = ArmKinematics(arm), home, finger
+        self._tool = tool
 
     def view(self) -> ExpertView:
         """Return the present state."""
@@ -293,7 +310,9 @@ class PhasedExpert:
         """Begin with the first phase; call it after the environment's reset."""
         self._joints = np.array(self._start)
         home = self._kinematics.forward(self._joints)
-        self._home = self._command = Command(home.translation(), home.rotation(), FINGER_OPEN)
+        if self._tool is not None:
+            home = home @ self._tool
+        self._home = self._command = Command(home.translation(), home.rotation(), self._finger)
         self.skip_to(0)
 
     def skip_to(self, number: int) -> None:
@@ -318,5 +337,7 @@ class PhasedExpert:
         self._command = self._phase.step(view)
         pose = (self._command.orientation, self._command.position)
         target = mink.SE3.from_rotation_and_translation(*pose)
+        if self._tool is not None:
+            target = target @ self._tool.inverse()
         self._joints = self._kinematics.inverse(target, self._joints)
         return np.append(self._joints, self._command.finger).astype(np.float32)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -15,6 +17,7 @@ from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, CameraRenderer
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.face import FACES
+from robo_manip_baselines.envs.mujoco.face.camera_mouth import CameraMouth
 from robo_manip_baselines.envs.mujoco.face.forecasters import (
     MotionForecasters,
     require_no_waiting,
@@ -32,9 +35,11 @@ from robo_manip_baselines.observation import (
     ObservationSpec,
     ObservedNames,
     State,
+    TargetObservation,
 )
 from robo_manip_baselines.observation.corruption import prediction_problem
 from robo_manip_baselines.observation.images import fit_image
+from robo_manip_baselines.observation.spec import CameraLatency
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_integer
 from robo_manip_baselines.runs.ranges import MAX_SEED
 
@@ -73,6 +78,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         render_size: height and width at which cameras are drawn, before `fit_image` makes the
             images of observations; ``image_size`` if None.
         corruption: a `Corruption`, or its fields as a dict; None shows the truth.
+        mouth_source, camera_latency: see `ObservationSpec` and ``docs/perception.md``.
         face: kind of face: ``visual``, which follows the recorded motion whatever touches it, or
             ``physical``, soft tissue on a head that yields, see ``docs/face_model.md``.
         face_motion: start of the motion: ``episode`` or ``after_lift``.
@@ -97,6 +103,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         measures_proximity: whether ``info`` has distances from the face, which take a tenth of a
             millisecond a step; evaluations set it.
         vector: (S,) float32, all vectors of the last observation, packed.
+        observed_target: the target of the last observation; None where it is the truth.
 
     Raises:
         RequestError: an argument is not valid.
@@ -123,6 +130,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         mouth_time: str = "now",
         arms: str = "right",
         corruption: Corruption | Mapping[str, Any] | None = None,
+        mouth_source: str = "truth",
+        camera_latency: CameraLatency = 1,
         face: str = "visual",
         face_motion: str = "episode",
         motion: str | Mapping[str, Any] | Sequence[Any] = "recorded",
@@ -150,6 +159,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             mouth_time=mouth_time,
             arms=arms,
             corruption=_make_corruption(corruption),
+            mouth_source=mouth_source,
+            camera_latency=camera_latency,
         )
         self.task.require_arms(spec.arms)
         _check_drawing(shadows, multisamples)
@@ -169,7 +180,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         self.library.require(motion_sha256)
         if self.motion.recorded is not None:
             self.library.part(self.people)  # refuses what cannot be split
-        self.task.require_forecasts(spec.corruption)
+        self.task.require_forecasts(spec)
         self._forecasters: MotionForecasters | None = None
         if spec.corruption.prediction != "truth":
             require_no_waiting(self.face_motion)
@@ -189,15 +200,22 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             )
         for clip in self.clips or ():
             require_choice("clip", clip, set(self.library.part(self.people).run_clip))
-        super().__init__(face, spec.arm_names, self.task.names.objects)
+        super().__init__(face, spec.arm_names, (*self.task.names.objects, *self.tools))
         self.renderer = CameraRenderer(
             self.model, *spec.drawn_size, shadows=shadows, multisamples=multisamples
         )
+        self.observed_target: TargetObservation | None = None
+        self._camera_mouth: CameraMouth | None = None
+        if spec.sees_by_camera:
+            has_depth = spec.mouth_source == "depth_camera"
+            self._camera_mouth = CameraMouth(self.model, spec.camera_latency, has_depth=has_depth)
         self._viewer: Any = None
+        self._shown_at = 0.0
         self._stage = "made"
         low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(low, high)
         self.observation_space = make_observation_space(spec, self.task.names)
+        self._slices = spec.slices(self.task.names)
 
     # -- task -----------------------------------------------------------------------------------
 
@@ -268,6 +286,8 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
                 self._forecast = self._forecasters.forecast_track(
                     self.observation_spec.corruption.prediction, self.replay.mouth, drawn
                 )
+        if self._camera_mouth:
+            self._camera_mouth.reset(self.data)
         self._stage = "reset"
         self._show()
         return self.observe(), {**self.info(), **safety_info(self)}
@@ -304,6 +324,9 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         """Free the OpenGL context, and close the viewer; may be called again."""
         self._stage = "closed"
         self.renderer.close()
+        if self._camera_mouth:
+            self._camera_mouth.close()
+            self._camera_mouth = None
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None
@@ -324,14 +347,19 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded(f"{method}() before reset(): call reset() first")
 
     def _show(self) -> None:
-        """Show the present state in MuJoCo's viewer, in mode ``human``."""
+        """Show the present state in MuJoCo's viewer, in mode ``human``, no faster than in life."""
         if self.render_mode != "human":
             return
         if self._viewer is None:
             from mujoco import viewer  # opens a display's libraries
 
             self._viewer = viewer.launch_passive(self.model, self.data)
+        if not self._viewer.is_running():  # the person has closed its window
+            return
         self._viewer.sync()
+        # From one frame to the next, so that a slow step is not followed by hasty ones.
+        time.sleep(max(0.0, self._shown_at + CONTROL_PERIOD - time.monotonic()))
+        self._shown_at = time.monotonic()
 
     # -- observation ----------------------------------------------------------------------------
 
@@ -358,13 +386,53 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         The vectors are views of ``vector``. Images are left out where ``renders_images`` is False.
         """
         spec, state = self.observation_spec, self.state()
-        self.vector = spec.pack(state, self._pipeline.observe(state) if self._pipeline else None)
-        observation: dict[str, NDArray[Any]] = {**spec.split(self.vector, self.task.names)}
+        self.observed_target = self._observe_target(state)
+        self.vector = spec.pack(state, self.observed_target)
+        observation: dict[str, NDArray[Any]] = {}
+        for name, part in self._slices.items():
+            observation[name] = self.vector[part]
         if spec.cameras and self.renders_images:
             views = self.renderer.render(self.data, spec.cameras)
             for key, camera in spec.image_keys().items():
                 observation[key] = fit_image(views[camera], spec.image_size)
         return observation
+
+    # -- the mouth as it is observed -------------------------------------------------------------
+
+    def watch_face(self, physics_step: int) -> None:
+        """Let the camera that looks for the mouth take its image, if there is one and it is due."""
+        if self._camera_mouth:
+            self._camera_mouth.watch(self.data, physics_step)
+
+    def _observe_target(self, state: State) -> TargetObservation | None:
+        """Return the target as it is observed; None where that is the truth."""
+        if self._pipeline:
+            return self._pipeline.observe(state)
+        if self._camera_mouth is None:
+            return None
+        past = self.observation_spec.past_frames
+        seen = self._camera_mouth.observe(self.time)
+        return replace(seen, past=self._camera_mouth.past(self.time, past) if past else None)
+
+    def forecast_mouth(self, seen: float, ahead: float) -> Floats:
+        """(3,) m, world: the mouth at ``seen + ahead`` s by what is observed; a `Forecast`.
+
+        The true one where observations show the truth. Otherwise that of the newest report,
+        whatever ``seen`` says, with the forecasts in it.
+        """
+        if self.observed_target is None:
+            return self.mouth_at(seen + ahead)
+        return self.observed_target.at(seen + ahead)
+
+    @property
+    def camera_mouth(self) -> CameraMouth | None:
+        """Camera that looks for the mouth, if one does."""
+        return self._camera_mouth
+
+    @property
+    def frames_without_detection(self) -> int | None:
+        """Images of the episode in which no face was found; None where nobody looks for one."""
+        return self._camera_mouth.frames_without_face if self._camera_mouth else None
 
     def start_attributes(self) -> dict[str, Any]:
         """Return the attributes of an episode file that are known after its reset.

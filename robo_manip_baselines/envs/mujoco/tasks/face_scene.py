@@ -46,6 +46,9 @@ class FaceScene:
         touch: contacts of the face in the last control step.
     """
 
+    tools: tuple[str, ...] = ()
+    """Bodies of the robot that count by themselves where a face is touched."""
+
     def __init__(self, face_kind: str, arms: Sequence[str], objects: Sequence[str]) -> None:
         self.face_kind = face_kind
         self.face = FaceModel.load()
@@ -65,6 +68,9 @@ class FaceScene:
 
     def watch_contacts(self) -> None:
         """Read the contacts of one physics step."""
+
+    def watch_face(self, physics_step: int) -> None:
+        """Look at the face after so many physics steps of the episode, if it is time for it."""
 
     # -- start -------------------------------------------------------------------------------------
 
@@ -92,7 +98,10 @@ class FaceScene:
         )
         # Of a physical face, the head moves by forces, and the mouth with it.
         placed = ("face/torso",) if self._compliant_head else self.replay.bodies
-        self._placed = {body: self.replay.bodies[body] for body in placed}
+        self._placed = np.array([self._mocap[body] for body in placed])
+        bodies = [self.replay.bodies[body] for body in placed]
+        self._positions = np.stack([position for position, _ in bodies], axis=1)  # (P, M, 3)
+        self._orientations = np.stack([turn for _, turn in bodies], axis=1)  # (P, M, 4)
         self._set_arm("left", PARKED_QPOS, FINGER_CLOSED)
         self._set_arm("right", HOME_QPOS, FINGER_OPEN)
 
@@ -138,6 +147,7 @@ class FaceScene:
             mujoco.mj_step(self.model, self.data)
             self.touch.read(self.model, self.data)
             self.watch_contacts()
+            self.watch_face(self.step_count * self.substeps + substep + 1)
         self.step_count += 1
         if self._compliant_head:
             self._compliant_head.place_mouth(self.data)
@@ -174,9 +184,8 @@ class FaceScene:
         if head and substep:
             head.drive(self.data, row)
             head.place_mouth(self.data)
-        for body, (position, orientation) in self._placed.items():
-            self.data.mocap_pos[self._mocap[body]] = position[row]
-            self.data.mocap_quat[self._mocap[body]] = orientation[row]
+        self.data.mocap_pos[self._placed] = self._positions[row]
+        self.data.mocap_quat[self._placed] = self._orientations[row]
 
     def _motion_step(self) -> int:
         """Control steps since the motion started; 0 while it waits."""

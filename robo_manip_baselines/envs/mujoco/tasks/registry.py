@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.observation import Corruption, ObservedNames
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.observation.spec import ARMS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 
@@ -31,6 +31,10 @@ TASKS = {
     "FaceWipingEnv": "robo_manip_baselines.envs.mujoco.tasks.wiping:ENTRY",
 }
 """Name of a task -> ``module:name`` of its `TaskEntry`."""
+
+IMPORTED = "ImportedEnv"
+"""Task of demonstrations that other programs recorded, see `imported_entry`: policies can be
+trained on them, and there is no environment to run."""
 
 
 @dataclass(frozen=True)
@@ -223,6 +227,7 @@ class TaskEntry:
         metrics: ``module:class`` of its `EpisodeMetrics`.
         failures: kind of failure -> description.
         arms: that can do it, of `ObservationSpec.arms`; the first is the default.
+        choices: arguments of its own environment -> valid values; the first is the default.
         names: of target and objects in observations.
         target_field, predicted_field: fields of an episode that hold the true target and a
             predictor's output for it; ``predicted_field`` is empty where the target is not the
@@ -238,6 +243,7 @@ class TaskEntry:
         goal_env: ``module:class`` of a goal-conditioned view of it, for reinforcement learning;
             empty without one. Commands do not take it.
         schema_version: lowest version of the episode schema that describes its files.
+        instruction: the task in words, as policies with language are told it.
     """
 
     name: str
@@ -248,6 +254,7 @@ class TaskEntry:
     failures: Mapping[str, str]
     version: int = 0
     arms: tuple[str, ...] = tuple(ARMS)
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     names: ObservedNames = field(default_factory=ObservedNames)
     target_field: str = "mouth_position"
     predicted_field: str = "predicted_mouth"
@@ -262,6 +269,7 @@ class TaskEntry:
     study: str = ""
     goal_env: str = ""
     schema_version: int = 3
+    instruction: str = ""
 
     def __post_init__(self) -> None:
         if len(self.names.objects) != len(self.object_fields):
@@ -277,6 +285,18 @@ class TaskEntry:
         """Registered id of the goal-conditioned view, if there is one."""
         return f"{NAMESPACE}/{self.name.removesuffix('Env')}GoalEnv-v{self.version}"
 
+    def require_env(self) -> None:
+        """Require that there is an environment to run.
+
+        Raises:
+            RequestError: there are only demonstrations.
+        """
+        if not self.env:
+            raise RequestError(
+                f"{self.name}: demonstrations of other programs, without an environment to run; "
+                f"train on them with bin/Train.py, or choose one of {', '.join(task_names())}"
+            )
+
     def require_arms(self, arms: str) -> None:
         """Require arms that can do the task.
 
@@ -287,6 +307,16 @@ class TaskEntry:
             raise RequestError(
                 f"arms {arms}: cannot do {self.name}; valid: {', '.join(sorted(self.arms))}"
             )
+
+    def require_argument(self, name: str, value: str) -> str:
+        """Return the value of an argument of the task's own environment.
+
+        Raises:
+            RequestError: the task has no such argument, or not that value.
+        """
+        if name not in self.choices:
+            raise RequestError(f"{name} {value}: {self.name} has no such choice; leave it out")
+        return require_choice(name, value, self.choices[name])
 
     def make_expert(self, name: str, env: Any) -> Expert:
         """Make a scripted expert for an unwrapped environment.
@@ -300,13 +330,17 @@ class TaskEntry:
         """Make the metrics of one episode."""
         return load_part(self.metrics)()
 
-    def require_forecasts(self, corruption: Corruption) -> None:
+    def require_forecasts(self, spec: ObservationSpec) -> None:
         """Require that the target is the mouth, which is what is forecast, if forecasts are shown.
+
+        A camera shows forecasts, too.
 
         Raises:
             RequestError: it is another point of the face.
         """
+        corruption = spec.corruption
         shown = corruption.prediction != "truth" and f"prediction {corruption.prediction}"
+        shown = shown or (spec.sees_by_camera and f"mouth_source {spec.mouth_source}")
         shown = shown or (corruption.error == "model" and "error model")
         if shown and not self.predicted_field:
             raise RequestError(
@@ -338,11 +372,13 @@ def task_names() -> list[str]:
 
 
 def task_entry(name: str) -> TaskEntry:
-    """Return the entry of a task.
+    """Return the entry of a task; also that of `IMPORTED`, which `task_names` does not list.
 
     Raises:
         RequestError: there is no such task.
     """
+    if name == IMPORTED:
+        return imported_entry()
     references = _references() | TASKS
     return load_part(references[require_choice("environment", name, references)])
 
@@ -377,8 +413,9 @@ def make_env(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """Make the environment of a task.
 
     Raises:
-        RequestError: there is no such task, or an argument is not valid.
+        RequestError: there is no such task, it has no environment, or an argument is not valid.
     """
+    task_entry(name).require_env()
     register_envs([name])
     return gymnasium.make(task_entry(name).env_id, **kwargs)
 
@@ -395,6 +432,8 @@ ENV_ARGUMENTS: Mapping[str, tuple[type, ...]] = {
     "mouth_time": (str,),
     "arms": (str,),
     "corruption": (dict, type(None)),
+    "mouth_source": (str,),
+    "camera_latency": (int, str),
     "face": (str,),
     "face_motion": (str,),
     "motion": (str,),
@@ -421,7 +460,7 @@ def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
     if not isinstance(kwargs, dict):
         return f"must be an object with names of arguments, not {str(kwargs)[:80]!r}"
     unknown = sorted(str(name) for name in kwargs if name not in ENV_ARGUMENTS)
-    if unknown and task is not None:
+    if unknown and task is not None and task.env:
         known = signature(load_part(task.env)).parameters
         unknown = [
             name
@@ -443,6 +482,27 @@ def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
     if kwargs.get("render_mode") not in (None, "rgb_array"):
         return "has a render_mode that opens windows"
     return ""
+
+
+@cache
+def imported_entry() -> TaskEntry:
+    """Return the entry of demonstrations that other programs recorded: no target, no object."""
+    return TaskEntry(
+        name=IMPORTED,
+        env="",
+        max_episode_steps=0,
+        experts={},
+        metrics="",
+        failures={},
+        target_field="",
+        predicted_field="",
+        attributes=(
+            Attribute("source_format", "text", "Format it was imported from, `rmb` or `aloha`"),
+            Attribute("source_name", "text", "Name of the file or folder it was imported from"),
+            Attribute("source_attributes", "json", "Attributes of that file"),
+            Attribute("instruction", "text", "The task in words, if the file has it"),
+        ),
+    )
 
 
 @cache

@@ -36,6 +36,8 @@ ENTRY = TaskEntry(
             in_tables=True,
         ),
     ),
+    instruction="Pick up the red cube with the left gripper, hand it to the right one, bring it to "
+    "the mouth of the person and let go of it.",
     success="handed over in the air, the cube was brought by the right gripper within 0.03, 0.01 "
     "and 0.01 m of the mouth",
     strict_success="the cube let go inside the mouth, never before, and the face never touched by "

@@ -90,6 +90,7 @@ ENTRY = TaskEntry(
             in_tables=True,
         ),
     ),
+    instruction="Bring the cup to the mouth of the person and pour the drink.",
     success="at least 75 % of the liquid went into the mouth, within 0.03 m of its centre",
     strict_success="at most 5 % was spilled, and the face never pressed with more than 10 N",
     completion_time="from the lift to success",

@@ -161,6 +161,9 @@ class DrinkingEnv(FaceEnv):
     | ``corruption`` | None | what stands between true and shown mouth: an
     ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
     3}``; None shows the truth |
+    | ``mouth_source`` | ``"truth"`` | truth, or camera or depth_camera: a face detector finds the
+    mouth in images of ``front_close`` (needs the extra ``face_prediction`` and OpenGL) |
+    | ``camera_latency`` | 1 | frames of 1/30 s from an image to its report, or ``"measured"`` |
     | ``arms`` | ``"right"`` | right or both |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,

@@ -201,8 +201,10 @@ class DrinkingServo(DrinkingExpert):
     Args:
         env: the environment, unwrapped.
         config: lead, delay and limits of the servo.
-        forecast: source of the mouth; the truth if None.
+        forecast: source of the mouth; what the environment observes, or else the truth, if None.
     """
+
+    goes_by_observation = True
 
     def __init__(
         self,
@@ -212,7 +214,7 @@ class DrinkingServo(DrinkingExpert):
     ) -> None:
         super().__init__(env)
         self._config = SERVO if config is None else config
-        self._forecast = self._truth if forecast is None else forecast
+        self._forecast = env.forecast_mouth if forecast is None else forecast
 
     def phases(self, home: Command) -> list[ExpertPhase]:
         """Return the phases of one episode, in order."""
@@ -231,6 +233,3 @@ class DrinkingServo(DrinkingExpert):
     def mouth(self, view: ExpertView) -> NDArray[np.float64]:
         """Return the newest mouth seen, (3,) m, world."""
         return self._forecast(view.time - self._config.delay * FRAME_PERIOD, 0.0)
-
-    def _truth(self, seen: float, ahead: float) -> NDArray[np.float64]:
-        return self._env.mouth_at(seen + ahead)

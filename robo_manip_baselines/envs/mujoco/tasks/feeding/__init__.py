@@ -26,6 +26,7 @@ ENTRY = TaskEntry(
         "anticipatory": f"{_PACKAGE}.expert:anticipatory",
         "servo": f"{_PACKAGE}.expert:servo",
     },
+    choices={"utensil": ("gripper", "spoon")},
     metrics=f"{_PACKAGE}.metrics:FeedingMetrics",
     failures={
         "never_grasped": "the cube was never lifted by 0.10 m",
@@ -98,6 +99,7 @@ ENTRY = TaskEntry(
             may_be_absent=True,
         ),
     ),
+    instruction="Bring the red cube to the mouth of the person and let go of it.",
     success="the gripper brought the cube within 0.03, 0.01 and 0.01 m of the mouth",
     strict_success="the cube let go inside the mouth, the face never touched",
     completion_time="from the lift to success",

@@ -9,16 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import CUBE_SIZE, add_cube
-from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED
+from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, HOME_QPOS
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
+from robo_manip_baselines.envs.mujoco.tasks.feeding.spoon import (
+    SPOON,
+    SPOON_FINGER,
+    SPOON_HOME_QPOS,
+    SPREAD,
+    Meal,
+    add_food,
+    add_spoon,
+)
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import (
+    FACE_FORCE,
     FeedingProgress,
     Phase,
     StepMeasurements,
     is_at_mouth,
 )
 from robo_manip_baselines.envs.mujoco.tasks.mouth import from_mouth, is_inside_mouth
+from robo_manip_baselines.runs.errors import require_choice
 
 CUBE_LOW = np.array([0.12, 0.42])
 CUBE_HIGH = np.array([0.22, 0.58])
@@ -39,7 +50,8 @@ _FINGER_BITS = {"right": (1, 2), "left": (4, 8)}
 class FeedingEnv(FaceEnv):
     """Pick up a red cube and bring it to the mouth of a head that moves as a person moved.
 
-    The task of the paper's section IV.C. Units are SI; the world frame is x right, y forward, z up
+    The task of the paper's section IV.C; with ``utensil="spoon"``, food on a spoon in place of the
+    cube. Units are SI; the world frame is x right, y forward, z up
     with the table's top at z = 0; quaternions are wxyz. Control is at 50 Hz.
 
     ## Action space
@@ -92,6 +104,8 @@ class FeedingEnv(FaceEnv):
 
     - the cube's centre, uniform in x 0.12 ... 0.22 and y 0.42 ... 0.58, on the table;
     - the mouth, (0, 0.5, 0.35) plus a uniform offset of +-0.05 along each axis;
+    - with a spoon, in place of that: the food on its bowl, +-0.002 m from the middle along and
+      across, and the arm with the spoon level, 0.1 m or more before the mouth;
     - the segment of recorded motion, its start uniform over all starts of the library; or another
       ``motion``, with the same cube and the same offset.
 
@@ -109,6 +123,8 @@ class FeedingEnv(FaceEnv):
     | ``is_success_strict`` | bool | ``is_success``, and the cube was let go with its centre inside
     the mouth opening, and since the lift the gripper has not touched lips or face |
     | ``mouth_position`` | (3,) | true mouth (m) |
+    | ``utensil_position`` | (3,) | what has to come to the mouth (m): the gripper's site, or the
+    middle of the rim of the spoon's bowl |
     | ``gripper_position`` | (3,) | site ``right/gripper`` (m) |
     | ``cube_offset`` | (3,) | centre of the cube from the mouth (m) in the face's axes: out along
     its normal, across to the person's left, up |
@@ -119,6 +135,16 @@ class FeedingEnv(FaceEnv):
     step |
 
     and what `FaceEnv` adds for every task.
+
+    ## With a spoon
+
+    The gripper holds the spoon for good, whatever the fingers do; the food, a cube of 0.014 m, lies
+    free on its bowl. It counts as lifted from the start. ``is_success`` is the same condition on
+    the middle of the bowl's rim, the food on it. The mouth closes on food that has been inside
+    it, on the spoon, for 0.3 s, and keeps it; ``is_success_strict`` is ``is_success`` with the food
+    taken so, and never more than 10 N between robot and face. Food that leaves the bowl otherwise
+    is spilled. The episode ends when the bowl has withdrawn by 0.12 m. The spoon counts
+    by itself (``spoon``) in ``face_contacts``.
 
     ## Episode end
 
@@ -143,9 +169,13 @@ class FeedingEnv(FaceEnv):
     | ``corruption`` | None | what stands between true and shown mouth: an
     ``observation.Corruption`` or its fields as a dict, such as ``{"error": "uniform", "delay":
     3}``; None shows the truth |
+    | ``mouth_source`` | ``"truth"`` | truth, or camera or depth_camera: a face detector finds the
+    mouth in images of ``front_close`` (needs the extra ``face_prediction`` and OpenGL) |
+    | ``camera_latency`` | 1 | frames of 1/30 s from an image to its report, or ``"measured"`` |
     | ``arms`` | ``"right"`` | right or both |
     | ``face`` | ``"visual"`` | kind of face: visual, or physical, soft tissue on a head that
     yields |
+    | ``utensil`` | ``"gripper"`` | gripper or spoon |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
@@ -169,9 +199,15 @@ class FeedingEnv(FaceEnv):
     task = ENTRY
     phase_names = tuple(phase.name.lower() for phase in Phase)
 
-    def __init__(self, **kwargs: Any) -> None:
+    def __init__(self, *, utensil: str = "gripper", **kwargs: Any) -> None:
+        valid = self.task.choices.get("utensil", ("gripper",))
+        self.utensil = require_choice("utensil", utensil, valid)
+        has_spoon = self.utensil == SPOON
+        self.tools = (SPOON,) if has_spoon else ()
         super().__init__(**kwargs)
         model = self.model
+        self.meal = Meal(model) if has_spoon else None
+        self._utensil_site = model.site(SPOON if has_spoon else "right/gripper").id
         self._cube_qpos = int(model.joint("cube").qposadr[0])
         self._cube_body = model.body("cube").id
         self._cube_geom = model.geom("cube").id
@@ -179,19 +215,32 @@ class FeedingEnv(FaceEnv):
         self._finger_bits = [_finger_bits(model, geom) for geom in range(model.ngeom)]
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """Add the red cube."""
-        add_cube(scene)
+        """Add the red cube, or a spoon and food for it."""
+        if self.utensil == SPOON:
+            add_spoon(scene)
+            add_food(scene)
+        else:
+            add_cube(scene)
 
     def reset_task(self, rng: np.random.Generator) -> None:
-        """Put the cube where `draw_cube` says, flat on the table."""
+        """Put the cube where `draw_cube` says, flat on the table, or food on the spoon."""
         self.progress = FeedingProgress()
         self._clear_contacts()
+        if self.meal:
+            self._set_arm("right", SPOON_HOME_QPOS, SPOON_FINGER)
+            self.meal.place(self.model, self.data, rng.uniform(-SPREAD, SPREAD, 2))
+            return
         x, y = self.draw_cube(rng)
         self.data.qpos[self._cube_qpos : self._cube_qpos + 7] = (x, y, CUBE_SIZE / 2, 1, 0, 0, 0)
 
     def draw_cube(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw where the cube starts, (2,) m, world x and y."""
         return rng.uniform(CUBE_LOW, CUBE_HIGH)
+
+    @property
+    def start_qpos(self) -> tuple[float, ...]:
+        """(6,) rad, joints of the right arm at the start."""
+        return SPOON_HOME_QPOS if self.meal else HOME_QPOS
 
     def hold_cube(self, joints: NDArray[np.float64], offset: float) -> None:
         """Go on, after a reset, with the cube in the closed gripper of the right arm.
@@ -226,6 +275,11 @@ class FeedingEnv(FaceEnv):
         return from_mouth(self.cube_position, self.mouth_track[0], axes)
 
     @property
+    def utensil_position(self) -> NDArray[np.float64]:
+        """(3,) m, world: the gripper's site, or the middle of the spoon's bowl."""
+        return self.data.site_xpos[self._utensil_site].copy()
+
+    @property
     def face_force(self) -> float:
         """N, the largest normal force between the robot and the face in the last step."""
         return self._face_force
@@ -239,6 +293,8 @@ class FeedingEnv(FaceEnv):
         """Apply an action for one control period, counting contacts afresh."""
         self._clear_contacts()
         super().simulate(action)
+        if self.meal:
+            self.meal.advance(self.model, self.data, is_inside=self._is_inside_mouth())
 
     def advance(self) -> tuple[float, bool]:
         """Evaluate the task after a control step; return reward and whether it has ended."""
@@ -267,6 +323,7 @@ class FeedingEnv(FaceEnv):
             "is_success_strict": progress.is_success_strict,
             "mouth_position": self.mouth_track[0],
             "gripper_position": self.gripper_position,
+            "utensil_position": self.utensil_position,
             "cube_offset": self.cube_offset,
             "phase": progress.phase.name.lower(),
             "time_since_lift": progress.time_since_lift(self.time),
@@ -280,6 +337,8 @@ class FeedingEnv(FaceEnv):
             if self._cube_geom in (first, second):
                 self._fingers_on_cube |= self._finger_bits[first] | self._finger_bits[second]
         self._face_force = max(self._face_force, self.max_face_force())
+        if self.meal:
+            self.meal.hold(self.data)
 
     def _clear_contacts(self) -> None:
         self._fingers_on_cube = 0
@@ -289,18 +348,22 @@ class FeedingEnv(FaceEnv):
         """Return how many fingers of an arm touched the cube in the last step."""
         return sum(bool(self._fingers_on_cube & bit) for bit in _FINGER_BITS[arm])
 
-    def _measure(self) -> StepMeasurements:
-        mouth, gripper = self.mouth_track[0], self.gripper_position
+    def _is_inside_mouth(self) -> bool:
         half_width, half_height = self.mouth_opening.tolist()
+        return is_inside_mouth(self.cube_offset, half_width, half_height)
+
+    def _measure(self) -> StepMeasurements:
+        mouth, utensil = self.mouth_track[0], self.utensil_position
+        is_on_spoon = self.meal is not None and self.meal.is_on_spoon(self.data)
         return StepMeasurements(
             time=self.time,
-            is_held=self._fingers_on("right") == 2,
-            is_touched=self._fingers_on("right") > 0,
+            is_held=is_on_spoon if self.meal else self._fingers_on("right") == 2,
+            is_touched=is_on_spoon if self.meal else self._fingers_on("right") > 0,
             cube_height=float(self.cube_position[2]),
-            is_at_mouth=is_at_mouth(gripper, mouth),
-            is_inside_mouth=is_inside_mouth(self.cube_offset, half_width, half_height),
-            touches_face=self._face_force > 0.0,
-            gripper_distance=float(np.linalg.norm(gripper - mouth)),
+            is_at_mouth=is_at_mouth(utensil, mouth),
+            is_inside_mouth=self._is_inside_mouth(),
+            touches_face=self._face_force > FACE_FORCE[self.utensil],
+            gripper_distance=float(np.linalg.norm(utensil - mouth)),
         )
 
 

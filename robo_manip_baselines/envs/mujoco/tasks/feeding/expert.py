@@ -34,6 +34,7 @@ from robo_manip_baselines.envs.mujoco.expert.servo import (
 )
 from robo_manip_baselines.envs.mujoco.tasks.feeding import APPROACH_LIMIT
 from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
+from robo_manip_baselines.envs.mujoco.tasks.feeding.spoon import SPOON_FINGER, TOOL
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import is_at_mouth
 from robo_manip_baselines.observation import FRAME_PERIOD
 
@@ -68,6 +69,21 @@ INSERTION_SPEED = 0.10
 
 WITHDRAWAL_SPEED = 0.30
 """m/s, likewise, at which it goes out."""
+
+SPOON_STANDOFF = np.array([0.12, 0.0, 0.0])
+SPOON_INSERTION = np.array([-0.004, 0.0, 0.0])
+SPOON_WITHDRAWAL = np.array([0.13, 0.0, 0.0])
+"""m from the mouth to the middle of the spoon's bowl, likewise: nearer, for the arm is behind it;
+and past the lips, so that they can close on the food."""
+
+SPOON_WAITING = 0.06
+"""m before the mouth where the servo waits with a spoon, whose bowl is 2 cm long."""
+
+SPOON_TIME = 0.9
+"""s in the mouth with a spoon: until the food is there, and the mouth has taken it."""
+
+SPOON_SERVO = ServoConfig(tolerance=(0.030, 0.008, 0.008))
+"""Settings of ``servo`` with a spoon."""
 
 ANTICIPATION = 4 * FRAME_PERIOD
 """s by which ``anticipatory`` looks ahead."""
@@ -133,7 +149,10 @@ class FeedingExpert(PhasedExpert):
     def __init__(
         self, env: FeedingEnv, lead: float = 0.0, *, limit: float = APPROACH_LIMIT
     ) -> None:
-        super().__init__()
+        if env.meal:
+            super().__init__(home=env.start_qpos, finger=SPOON_FINGER, tool=TOOL)
+        else:
+            super().__init__()
         self._env, self._lead, self._limit = env, lead, limit
 
     def view(self) -> ExpertView:
@@ -143,22 +162,30 @@ class FeedingExpert(PhasedExpert):
             target_track=mouth,
             object_position=env.cube_position,
             elapsed=env.progress.time_since_lift(env.time),
-            is_at_target=is_at_mouth(env.gripper_position, mouth[0]),
+            is_at_target=is_at_mouth(env.utensil_position, mouth[0]),
             time=env.time,
-            gripper_position=env.gripper_position,
+            gripper_position=env.utensil_position,
         )
 
     def phases(self, home: Command) -> list[ExpertPhase]:
         """Return the phases of one episode, in order."""
-        # Phase 1: approach and grasp the cube.
-        return [*pick_up(), bring(self.standoff), *self.delivery(home)]
+        # Phase 1: approach and grasp the cube, unless food is on a spoon.
+        fetch = [] if self._env.meal else pick_up()
+        return [*fetch, bring(self.standoff), *self.delivery(home)]
 
     def standoff(self, view: ExpertView) -> NDArray[np.float64]:
         """Return where the approach to the mouth starts, (3,) m, world."""
-        return view.target() + STANDOFF
+        return view.target() + (SPOON_STANDOFF if self._env.meal else STANDOFF)
 
     def delivery(self, home: Command) -> list[ExpertPhase]:
         """Return the phases from there on: to the mouth, let go, and home."""
+        if self._env.meal:
+            return [
+                Approach(limit=self._limit, lead=self._lead),
+                Follow(SPOON_INSERTION, SPOON_TIME, lead=self._lead),
+                Follow(SPOON_WITHDRAWAL, 0.8, lead=self._lead, speed=0.3),
+                Reach(lambda view, last: home),
+            ]
         return [
             # Phase 2: move towards the mouth.
             Approach(limit=self._limit, lead=self._lead),
@@ -181,9 +208,11 @@ class FeedingServo(FeedingExpert):
     Args:
         env: the environment, unwrapped.
         config: lead, delay and limits of the servo.
-        forecast: source of the mouth; the truth if None.
+        forecast: source of the mouth; what the environment observes, or else the truth, if None.
         execution: of its plans, from the insertion on.
     """
+
+    goes_by_observation = True
 
     def __init__(
         self,
@@ -193,8 +222,9 @@ class FeedingServo(FeedingExpert):
         execution: Execution = first_of,
     ) -> None:
         super().__init__(env)
-        self._config = ServoConfig() if config is None else config
-        self._forecast = self._truth if forecast is None else forecast
+        usual = SPOON_SERVO if env.meal else ServoConfig()
+        self._config = usual if config is None else config
+        self._forecast = env.forecast_mouth if forecast is None else forecast
         self._execution = execution
 
     def branch(
@@ -212,14 +242,23 @@ class FeedingServo(FeedingExpert):
 
     def standoff(self, view: ExpertView) -> NDArray[np.float64]:
         """Return where the approach to the mouth starts, (3,) m, world."""
-        return self._seen(view) + STANDOFF
+        return self._seen(view) + (SPOON_STANDOFF if self._env.meal else STANDOFF)
 
     def delivery(self, home: Command) -> list[ExpertPhase]:
         """Return the phases from there on: to the mouth, let go, and home."""
         forecast, config = self._forecast, self._config
-        inside, out = float(INSERTION[0]), float(WITHDRAWAL[0])
+        has_spoon = self._env.meal is not None
+        inside = float((SPOON_INSERTION if has_spoon else INSERTION)[0])
+        out = float((SPOON_WITHDRAWAL if has_spoon else WITHDRAWAL)[0])
         coming: Any = {"goal": inside, "rate": INSERTION_SPEED, "execution": self._execution}
         going: Any = {"goal": out, "rate": WITHDRAWAL_SPEED, "execution": self._execution}
+        if has_spoon:
+            return [
+                Insert(forecast, config, **coming, waiting=SPOON_WAITING),
+                Hold(forecast, config, **coming, duration=SPOON_TIME),
+                Hold(forecast, config, **going, duration=0.8),
+                Reach(lambda view, last: home),
+            ]
         return [
             Insert(forecast, config, **coming, waiting=WAITING),
             Hold(forecast, config, **coming, duration=0.3, finger=FINGER_OPEN),
@@ -230,6 +269,3 @@ class FeedingServo(FeedingExpert):
     def _seen(self, view: ExpertView) -> NDArray[np.float64]:
         """Return the newest mouth seen, (3,) m."""
         return self._forecast(view.time - self._config.delay * FRAME_PERIOD, 0.0)
-
-    def _truth(self, seen: float, ahead: float) -> NDArray[np.float64]:
-        return self._env.mouth_at(seen + ahead)

@@ -43,7 +43,7 @@ class FeedingMetrics:
         self._force.update(float(info["face_force"]))
         if info["phase"] not in CARRYING:
             return
-        gripper, mouth = np.asarray(info["gripper_position"]), np.asarray(info["mouth_position"])
+        gripper, mouth = np.asarray(info["utensil_position"]), np.asarray(info["mouth_position"])
         self._steps_inside += is_at_mouth(gripper, mouth)
         offset = gripper - mouth
         distance = float(np.linalg.norm(offset))

@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 MOUTH_TOLERANCE = np.array([0.03, 0.01, 0.01])
 """m along world x (the face normal), y and z; the spatial condition of Algorithm 1, line 10."""
 
+FACE_FORCE = {"gripper": 0.0, "spoon": 10.0}
+"""N between robot and face beyond which strict success is lost: none for a gripper, which has
+nothing to do at a face; for a spoon, which rests on lips, that of `safety.SAFE_FORCE`."""
+
 LIFT_HEIGHT = 0.10
 """m of the cube's centre above the table from which it counts as lifted: clear of the table by
 twice its size, and low enough that the way to the mouth still lies ahead."""
@@ -32,7 +36,8 @@ class Phase(enum.IntEnum):
 def is_at_mouth(gripper: NDArray[np.float64], mouth: NDArray[np.float64]) -> bool:
     """Algorithm 1's spatial condition on two points, (3,) m, in the world frame.
 
-    They are within 0.03, 0.01 and 0.01 m of one another, the bounds excluded.
+    The first one is the gripper, or the middle of a spoon's bowl. They are within 0.03, 0.01 and
+    0.01 m of one another, the bounds excluded.
     """
     return bool(np.all(np.abs(gripper - mouth) < MOUTH_TOLERANCE))
 
@@ -43,13 +48,13 @@ class StepMeasurements:
 
     Attributes:
         time: s since the start of the episode.
-        is_held: both fingers touch the cube.
-        is_touched: any finger touches the cube.
+        is_held: both fingers touch the cube; or the food is on the spoon.
+        is_touched: any finger touches the cube; or the food is on the spoon.
         cube_height: m of the cube's centre above the table.
         is_at_mouth: see the predicate of that name.
         is_inside_mouth: the centre of the cube is, see `mouth.is_inside_mouth`.
-        touches_face: the gripper touches lips or face.
-        gripper_distance: m between gripper and mouth.
+        touches_face: the robot presses lips or face with more than `FACE_FORCE`.
+        gripper_distance: m between gripper, or spoon, and mouth.
     """
 
     time: float

@@ -66,6 +66,7 @@ ENTRY = TaskEntry(
         ),
         *FORCE_COLUMNS,
     ),
+    instruction="Wipe the residue off the cheek of the person.",
     success="80 % of the residue was wiped off with 1 to 3 N",
     strict_success="and 1 to 3 N in at least 70 % of the contact, never more than 10 N, and no eye "
     "touched, until the end",

@@ -1,0 +1,1 @@
+"""Episode files to and from the formats of LeRobot, RoboManipBaselines and ALOHA."""
