@@ -37,6 +37,7 @@ from robo_manip_baselines.teleop.device import DEVICES, TeleopDevice, make_devic
 from robo_manip_baselines.teleop.recording import EpisodeStore, free_seeds
 from robo_manip_baselines.teleop.replay import ReplayDevice
 from robo_manip_baselines.teleop.session import SessionSummary, TeleopSession
+from robo_manip_baselines.teleop.shared import CheckpointPolicy, read_shared
 
 STEERED: Mapping[str, tuple[str, ...]] = {
     "right": ("right",),
@@ -135,8 +136,6 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
     checkpoint = None
     live: dict[str, Any] = {**kwargs, "cameras": ()}
     if config.policy and config.checkpoint:
-        from robo_manip_baselines.teleop.shared import CheckpointPolicy, read_shared
-
         checkpoint = read_shared(config.policy, config.checkpoint, config.env)
         if checkpoint.spec.cameras and (problem := opengl_problem()):
             raise RequestError(f"{problem} (the policy sees images)")

@@ -312,7 +312,7 @@ class WebDevice:
             self._step = gui.add_slider("Step of a key, mm", 1, 20, 1, 5)
 
             @self._opening.on_update
-            async def _(event: Any) -> None:
+            async def note_opening(event: Any) -> None:
                 if event.client_id is not None:  # and not set by `_show`
                     self._actions.append(Opening(float(self._opening.value)))
 
