@@ -48,7 +48,7 @@ API_MODULES = {
 SEARCH_SHIM = "https://unpkg.com/iframe-worker/shim"
 """Address from which Material's plugin ``offline`` would load it."""
 
-DATASET_COMMANDS = ("info", "verify", "plot")
+DATASET_COMMANDS = ("info", "verify", "plot", "view", "merge", "split", "compare", "tile")
 
 os.environ["COLUMNS"] = "80"  # of the pages of help
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -33,20 +34,21 @@ class ExtractOptions:
     A track that is already there, of the same video with the same settings, is kept: a run that
     was killed carries on when started again.
 
-    Example: face-prediction extract clips/*.mp4 --model face_landmarker.task --out face_tracks
+    Example: face-prediction extract clips/*.mp4 --detector_model face_landmarker.task
 
     Attributes:
         videos: Video files, of any kind that PyAV (FFmpeg) opens.
         out: Folder for the tracks.
-        model: MediaPipe's face_landmarker.task. By default the one in ~/.cache/face_prediction (or
-            $XDG_CACHE_HOME/face_prediction), downloaded once if there is a network.
+        detector_model: MediaPipe's face_landmarker.task. By default the one in
+            ~/.cache/face_prediction (or $XDG_CACHE_HOME/face_prediction), downloaded once if there
+            is a network.
         settings: Settings of the tracks.
         progress: Show a progress bar for every video.
     """
 
     videos: tyro.conf.Positional[tuple[Path, ...]]
     out: Path = Path("face_tracks")
-    model: Path | None = None
+    detector_model: Annotated[Path | None, tyro.conf.arg(aliases=["--model"])] = None
     settings: tyro.conf.OmitArgPrefixes[ExtractSettings] = field(default_factory=ExtractSettings)
     progress: bool = True
 
@@ -62,7 +64,7 @@ def run_extract(options: ExtractOptions) -> int:
         WriteError: there is no room to write tracks.
     """
     outputs = output_paths(options.videos, options.out)
-    model = find_model(options.model)
+    model = find_model(options.detector_model)
     made = kept = 0
     refused: list[str] = []
     failed: list[str] = []

@@ -81,7 +81,7 @@ def run_live(options: LiveOptions) -> int:
     """
     check_live_options(options)
     name, forecaster, settings = load_forecaster(options.checkpoint, options.dataset)
-    model = find_model(options.detector_model, option="--detector_model")
+    model = find_model(options.detector_model)
     rate = settings.fps
     if options.video is not None:
         with VideoReader(options.video) as reader:

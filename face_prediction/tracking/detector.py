@@ -48,7 +48,7 @@ def find_model(
     given: Path | None,
     url: str = MODEL_URL,
     expected: str = MODEL_SHA256,
-    option: str = "--model",
+    option: str = "--detector_model",
 ) -> Path:
     """The model to use: ``given`` if named, else the cached one, downloaded once if absent.
 

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from robo_manip_baselines.envs.mujoco.tasks.feeding import ENTRY
 from robo_manip_baselines.observation import PRESETS
@@ -20,9 +21,30 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
 COMMAND = re.compile(r"(python bin/|face-prediction |make )\S+")
 
 
+FIRST_PAGES = ("installation", "environments", "datasets", "examples")
+"""Pages of docs/ whose commands and programs are tested as those of the README."""
+
+MAX_LINES = 150
+MAX_ANIMATION = 2_000_000  # bytes: it is loaded by everybody who looks at the project
+
+
 @pytest.fixture(scope="module")
 def readme(repository: Path) -> str:
-    return (repository / "README.md").read_text(encoding="utf-8")
+    """Return the README and the pages that it leads to first, one after another."""
+    pages = [repository / "README.md", *(repository / "docs" / f"{n}.md" for n in FIRST_PAGES)]
+    return "\n\n".join(page.read_text(encoding="utf-8") for page in pages)
+
+
+def test_the_readme_is_short_and_begins_with_an_animation(repository: Path) -> None:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) < MAX_LINES
+    first = repository / LINK.findall(text)[0]
+    assert first.suffix == ".webp"
+    assert first.stat().st_size < MAX_ANIMATION
+    with Image.open(first) as animation:
+        assert getattr(animation, "n_frames", 1) > 50
+    for page in FIRST_PAGES:
+        assert f"docs/{page}.md" in text
 
 
 def fenced(text: str, language: str) -> list[str]:
@@ -70,7 +92,7 @@ def test_make_targets_exist(readme: str, repository: Path) -> None:
 def test_every_option_of_a_command_is_in_its_help(readme: str, repository: Path) -> None:
     checked = 0
     for words in commands(readme):
-        if words[0] == "python" and len(words) > 1:
+        if words[0] == "python" and words[1].startswith("bin/"):
             program = [words[1]]
             arguments = words[2:]
         elif words[0] == "face-prediction":
@@ -153,5 +175,6 @@ def test_images_are_used(repository: Path, project_files: list[Path]) -> None:
         for page in documents(project_files)
         for target in LINK.findall((repository / page).read_text(encoding="utf-8"))
     }
-    images = {str(f) for f in project_files if f.parts[0] == "docs" and f.suffix == ".png"}
+    suffixes = (".png", ".webp")
+    images = {str(f) for f in project_files if f.parts[0] == "docs" and f.suffix in suffixes}
     assert images <= used

@@ -19,6 +19,9 @@ OURS = {
         f"robo_manip_baselines/policy/shipped/{name}/model.safetensors"
         for name in ("baseline", "current", "forecast")
     ),
+    # renderings of the simulator, by the programs beside them
+    "docs/images/suite.webp",
+    "docs/images/dataset_view.webp",
 }
 MODELS = {".task", ".tflite", ".pt", ".pth", ".onnx", ".safetensors"}
 
