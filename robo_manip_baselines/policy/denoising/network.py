@@ -335,6 +335,7 @@ def filled(batch: Batch) -> Tensor:
     return torch.where(batch.is_pad[..., None], batch.action.gather(1, last), batch.action)
 
 
-def squared_error(found: Tensor, wanted: Tensor, num_examples: Tensor) -> Tensor:
-    """Return the mean squared error over all steps of (B, K, A)."""
-    return (found - wanted).square().sum() / (num_examples * math.prod(found.shape[1:]))
+def squared_error(found: Tensor, wanted: Tensor, batch: Batch) -> Tensor:
+    """Return the mean squared error over all steps of (B, K, A), with the weights of the batch."""
+    error = batch.weighted((found - wanted).square())
+    return error.sum() / (batch.num_examples * math.prod(found.shape[1:]))
