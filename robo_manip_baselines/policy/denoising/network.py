@@ -174,7 +174,7 @@ class ImageEncoder(nn.Module):
     """Image features as coordinates of keypoints: convolutions, then a spatial softmax.
 
     The ResNet-18 is ACT's, whose normalisation is frozen, in place of the group normalisation of
-    Chi et al.; images are not cropped at random.
+    Chi et al.; to shift images at random is an option of the training.
     """
 
     mean: Tensor
