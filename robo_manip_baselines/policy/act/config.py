@@ -154,7 +154,7 @@ PRESETS = {
     "cpu_images": PolicyPreset(
         config=replace(_SMALL, vision="small"),
         training=replace(
-            STATE_ONLY_TRAINING, batch_size=16, steps=6000, augment="shift", augment_shift=0.02
+            STATE_ONLY_TRAINING, batch_size=16, steps=12000, augment="shift", augment_shift=0.02
         ),
         # Images are drawn and encoded for every tenth step only.
         execution=ActionExecution(temporal_ensemble=False, n_action_steps=10),
