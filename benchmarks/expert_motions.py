@@ -158,8 +158,8 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / CELLS
     with locked(options.out, is_kept=False):
-        for env in envs:
-            for motion in motions:
+        for motion in motions:  # row by row: a table that was stopped has whole ones
+            for env in envs:
                 wanted = (env, options.expert, motion, options.face, options.seed)
                 if (*wanted, options.num_episodes) not in read_cells(path):
                     cell = measure(env, motion, options)

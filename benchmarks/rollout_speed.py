@@ -4,13 +4,15 @@ The policy holds the arm still and costs nothing, so the figures are those of th
 the shared memory and of the pipes; ``--checkpoint`` puts a trained policy in its place. Starting
 the processes is left out: every environment has done its first reset before the clock runs.
 
+On a machine that others use, ``--cpu_time`` counts the processor time of the main process instead.
+
 Example: python benchmarks/rollout_speed.py --num_envs 1 8 --workers 0 2
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.observation.spec import ImageSize
 from robo_manip_baselines.rollout.evaluation import EvaluationConfig, EvaluationPlan
@@ -31,6 +34,8 @@ from robo_manip_baselines.runs.errors import RequestError
 class Options:
     """Run short episodes in every arrangement and print their speed."""
 
+    envs: tuple[str, ...] = ("FeedingEnv",)
+    """Tasks; a checkpoint brings its own."""
     num_envs: tuple[int, ...] = (1, 2, 8)
     """Numbers of environments to try."""
     workers: tuple[int, ...] = (0, 1, 2)
@@ -41,10 +46,23 @@ class Options:
     """Height x width of the camera's images."""
     checkpoint: Path | None = None
     """A trained policy that acts in place of none at all."""
+    cpu_time: bool = False
+    """Count processor time; only with --workers 0."""
+
+
+ARM_STATE = 14
+"""Numbers of an arm in an observation: 6 positions, 6 velocities, gripper, and its velocity."""
 
 
 class Still:
-    """Holds the arm where it is, and needs every image if there are any."""
+    """Holds the arms where they are, and needs every image if there are any.
+
+    Args:
+        arms: how many.
+    """
+
+    def __init__(self, arms: int = 1) -> None:
+        self._arms = arms
 
     def reset(self, env_ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
         """Nothing to forget."""
@@ -59,12 +77,19 @@ class Still:
         images: NDArray[np.uint8] | None,
         env_ids: NDArray[np.intp],
     ) -> NDArray[np.float32]:
-        """Return the joints' positions; the gripper stays open."""
-        return np.concatenate([vectors[:, :6], vectors[:, 12:13]], axis=1)
+        """Return the positions of joints and grippers."""
+        state = vectors[:, : self._arms * ARM_STATE].reshape(-1, self._arms, ARM_STATE)
+        actions = np.concatenate([state[..., :6], state[..., 12:13]], axis=-1)
+        return actions.reshape(len(vectors), -1)
 
 
 def measure(
-    config: EnvConfig, num_envs: int, workers: int, steps: int, policy: ActingPolicy
+    config: EnvConfig,
+    num_envs: int,
+    workers: int,
+    steps: int,
+    policy: ActingPolicy,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> float:
     """Return control steps per second."""
     length = -(-steps // num_envs)
@@ -74,9 +99,9 @@ def measure(
         waiting = num_envs
         while waiting:
             waiting -= len(envs.wait())
-        begin = time.perf_counter()
+        begin = clock()
         results = rollout(policy, envs, range(num_envs))
-        return sum(result.steps for result in results) / (time.perf_counter() - begin)
+        return sum(result.steps for result in results) / (clock() - begin)
 
 
 def main() -> None:
@@ -84,6 +109,9 @@ def main() -> None:
     options = parse(Options, "python benchmarks/rollout_speed.py --num_envs 1 8 --workers 0 2")
     if min(options.num_envs) < 1 or min(options.workers) < 0 or options.steps < 1:
         raise RequestError("num_envs and steps are 1 or more, workers 0 or more")
+    if options.cpu_time and set(options.workers) != {0}:
+        raise RequestError("cpu_time goes with --workers 0: the main process does all of the work")
+    clock = time.process_time if options.cpu_time else time.perf_counter
     plan = None
     if options.checkpoint is not None:
         plan = EvaluationPlan.of(EvaluationConfig(options.checkpoint, range(1)))
@@ -101,7 +129,8 @@ def main() -> None:
                     num_envs,
                     workers,
                     options.steps,
-                    plan.make_policy(num_envs) if plan else Still(),
+                    plan.make_policy(num_envs) if plan else Still(len(config.spec.arm_names)),
+                    clock,
                 )
                 for workers in options.workers
             ]
@@ -120,7 +149,14 @@ def configs(options: Options, plan: EvaluationPlan | None) -> dict[str, EnvConfi
     if problem := opengl_problem():
         print(f"no camera: {problem}")
         named = {"state only": state}
-    return {name: EnvConfig("FeedingEnv", spec) for name, spec in named.items()}
+    found = {}
+    for env in options.envs:
+        task = task_entry(env)
+        for name, spec in named.items():
+            has_objects = bool(task.names.objects)
+            own = replace(spec, arms=task.arms[0], object_pose=has_objects)
+            found[f"{env}, {name}"] = EnvConfig(env, own)
+    return found
 
 
 if __name__ == "__main__":

@@ -43,6 +43,14 @@ HEAD_DEPTH = 0.04
 """m by which measured distances of a head may be off from their median: what is farther off is a
 hand before it or a wall behind it."""
 
+HEAD_SHARE = 0.75
+"""Quantile of the distances at the rigid landmarks that is taken for the head's: what hides some of
+them, a gripper or the nose, is nearer. That the others are a little nearer, too, is made up for by
+the lips' distance from it."""
+
+LIP_CHANGE = 0.01
+"""m by which the lips' distance from the head may change once it is known."""
+
 LIP_DEPTH = 0.03
 """m, likewise of the outer lips: 5 cm wide, seen from the side, and tilted by an open jaw."""
 
@@ -97,8 +105,9 @@ def agreed_excess(
     depth: NDArray[np.floating],
     tolerance: float,
     least: int,
+    share: float | None = None,
 ) -> float | None:
-    """Mean in m by which points are farther away in a depth image than expected.
+    """Distance in m by which points are farther away in a depth image than expected.
 
     Args:
         points: (P, 2) normalised image coordinates.
@@ -106,6 +115,7 @@ def agreed_excess(
         depth: (rows, columns) m along the view.
         tolerance: m from the median within which a point counts.
         least: points that must count; None is returned with fewer.
+        share: quantile of those that count which is returned; their mean if None.
     """
     rows, columns = depth.shape
     pixels = np.floor(points * (columns, rows)).astype(int)
@@ -115,7 +125,9 @@ def agreed_excess(
     if len(excess) < least:
         return None
     ours = np.abs(excess - np.median(excess)) < tolerance
-    return float(excess[ours].mean()) if ours.sum() >= least else None
+    if ours.sum() < least:
+        return None
+    return float(excess[ours].mean() if share is None else np.quantile(excess[ours], share))
 
 
 class Forecaster(Protocol):
@@ -199,12 +211,15 @@ class MouthTracker:
         something hides the mouth.
         """
         expected = -(_POINTS @ pose[:3, :3].T + pose[:3, 3])[:, 2]
-        farther = agreed_excess(points[_INDEX], expected, depth, HEAD_DEPTH, LEAST_RIGID)
+        farther = agreed_excess(
+            points[_INDEX], expected, depth, HEAD_DEPTH, LEAST_RIGID, HEAD_SHARE
+        )
         if farther is None:
             return distance + self._lips
         distance += farther
         lips = agreed_excess(points[list(OUTER_LIPS)], distance, depth, LIP_DEPTH, LEAST_LIPS)
-        if lips is not None and abs(lips) < LIP_DEPTH:
+        change = LIP_CHANGE if self._lip_images >= LIP_IMAGES else LIP_DEPTH
+        if lips is not None and abs(lips - self._lips) < change:
             self._lip_images += 1
             self._lips += (lips - self._lips) / min(self._lip_images, LIP_IMAGES)
         return distance + self._lips

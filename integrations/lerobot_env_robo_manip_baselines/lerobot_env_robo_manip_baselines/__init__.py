@@ -34,6 +34,7 @@ class RoboManipBaselinesConfig(EnvConfig):
         arms: ``right`` or ``both``; those of the task if None.
         motion, people, face: of the head, see `FaceEnv`.
         episode_length: time limit in steps; that of the task if None.
+        arguments: further ones of the task's environment.
     """
 
     task: str | None = "FeedingEnv"
@@ -54,6 +55,7 @@ class RoboManipBaselinesConfig(EnvConfig):
     people: str = "all"
     face: str = "visual"
     episode_length: int | None = None
+    arguments: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         entry = task_entry(self.task or "")
@@ -94,7 +96,8 @@ class RoboManipBaselinesConfig(EnvConfig):
         """Arguments of `LeRobotView`."""
         world = {"motion": self.motion, "people": self.people, "face": self.face}
         limit = {"max_episode_steps": self.episode_length}
-        return {**self.spec.env_kwargs(), **world, **limit, "render_mode": "rgb_array"}
+        given = {**self.spec.env_kwargs(), **world, **self.arguments}
+        return {**given, **limit, "render_mode": "rgb_array"}
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False

@@ -1,10 +1,14 @@
 """Drinking: bring a cup with a spout to the mouth of a person who moves, and let them drink."""
 
+from robo_manip_baselines.envs.mujoco.tasks.lift import (
+    TIME_SINCE_LIFT,
+    pose_field,
+    start_attribute,
+)
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     FACE_ATTRIBUTES,
     FACE_FIELDS,
     FORCE_COLUMNS,
-    Attribute,
     Field,
     ResultColumn,
     TaskEntry,
@@ -30,14 +34,9 @@ ENTRY = TaskEntry(
     object_fields=("object_pose",),
     fields=(
         *FACE_FIELDS,
-        Field(
-            "object_pose",
-            ("T", 7),
+        pose_field(
             "The cup: x, y, z of the middle of its body, then quaternion w, x, y, z; its x axis "
-            "points to the spout, its z axis up along the body",
-            "m, 1",
-            "world",
-            rule="unit quaternion",
+            "points to the spout, its z axis up along the body"
         ),
         Field(
             "liquid",
@@ -49,17 +48,10 @@ ENTRY = TaskEntry(
     ),
     attributes=(
         *FACE_ATTRIBUTES,
-        Attribute(
-            "object_initial_pose", "vector", "Start pose of the cup, as `object_pose`", length=7
-        ),
+        start_attribute("cup"),
     ),
     columns=(
-        ResultColumn(
-            "time_since_lift",
-            "float",
-            "s from the lift to the end of the episode; null without a lift",
-            is_optional=True,
-        ),
+        TIME_SINCE_LIFT,
         ResultColumn(
             "delivered",
             "float",

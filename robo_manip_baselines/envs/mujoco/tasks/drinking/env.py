@@ -246,7 +246,7 @@ class DrinkingEnv(FaceEnv):
         """The open mouth now."""
         axes = self.data.site_xmat[self._mouth_site].reshape(3, 3).copy()
         half_width, half_height = self.mouth_opening.tolist()
-        return Mouth(self.mouth_track[0], axes, half_width, half_height)
+        return Mouth(self.mouth_position, axes, half_width, half_height)
 
     @property
     def face_force(self) -> float:
@@ -290,7 +290,7 @@ class DrinkingEnv(FaceEnv):
         return {
             "is_success": progress.is_success,
             "is_success_strict": progress.is_success_strict,
-            "mouth_position": self.mouth_track[0],
+            "mouth_position": self.mouth_position,
             "gripper_position": self.gripper_position,
             "spout_position": spout,
             "is_spout_inside": self.mouth.holds(spout),
@@ -340,6 +340,6 @@ class DrinkingEnv(FaceEnv):
             lift=float(self.cup_position[2]) - BODY_HEIGHT / 2,
             liquid=self.liquid,
             face_force=self._face_force,
-            spout_distance=float(np.linalg.norm(spout - self.mouth_track[0])),
+            spout_distance=float(np.linalg.norm(spout - self.mouth_position)),
             is_upright=bool(axes[2, 2] >= UPRIGHT),
         )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.tasks.drinking.liquid import Liquid, jet_at
+from robo_manip_baselines.envs.mujoco.tasks.lift import LiftProgress
 from robo_manip_baselines.envs.mujoco.tasks.mouth import LIP_DEPTH, from_mouth, is_inside_mouth
 from robo_manip_baselines.envs.mujoco.tasks.registry import FORCE_LIMITS
 
@@ -124,7 +125,7 @@ class StepMeasurements:
 
 
 @dataclass(frozen=True)
-class DrinkingProgress:
+class DrinkingProgress(LiftProgress):
     """Events of an episode so far; ``advance`` returns the next.
 
     Attributes:
@@ -137,33 +138,15 @@ class DrinkingProgress:
     """
 
     phase: Phase = Phase.REACH
-    lift_time: float | None = None
-    success_time: float | None = None
     liquid: Liquid = field(default_factory=Liquid)
     largest_force: float = 0.0
     is_clear: bool = False
-
-    @property
-    def is_success(self) -> bool:
-        """Enough of the liquid has been delivered."""
-        return self.success_time is not None
 
     @property
     def is_success_strict(self) -> bool:
         """As well, little was spilled, and the face never pressed harder than gently."""
         spilled, force = self.liquid.spilled_share, self.largest_force
         return self.is_success and spilled <= SPILLED_SHARE and force <= GENTLE_FORCE
-
-    @property
-    def completion_time(self) -> float | None:
-        """s from the lift to the success; None before."""
-        if self.success_time is None or self.lift_time is None:
-            return None
-        return self.success_time - self.lift_time
-
-    def time_since_lift(self, time: float) -> float | None:
-        """s since the lift; None before."""
-        return None if self.lift_time is None else time - self.lift_time
 
     def advance(self, step: StepMeasurements) -> DrinkingProgress:
         """Take in the measurements of one control step."""

@@ -1,11 +1,14 @@
 """Feeding: bring a cube to the mouth of a person who moves (paper, section IV.C)."""
 
+from robo_manip_baselines.envs.mujoco.tasks.lift import (
+    TIME_SINCE_LIFT,
+    pose_field,
+    start_attribute,
+)
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     FACE_ATTRIBUTES,
     FACE_FIELDS,
     FORCE_COLUMNS,
-    Attribute,
-    Field,
     ResultColumn,
     TaskEntry,
 )
@@ -43,28 +46,14 @@ ENTRY = TaskEntry(
     object_fields=("object_pose",),
     fields=(
         *FACE_FIELDS,
-        Field(
-            "object_pose",
-            ("T", 7),
-            "The cube: x, y, z, then quaternion w, x, y, z",
-            "m, 1",
-            "world",
-            rule="unit quaternion",
-        ),
+        pose_field("The cube: x, y, z, then quaternion w, x, y, z"),
     ),
     attributes=(
         *FACE_ATTRIBUTES,
-        Attribute(
-            "object_initial_pose", "vector", "Start pose of the cube, as `object_pose`", length=7
-        ),
+        start_attribute("cube"),
     ),
     columns=(
-        ResultColumn(
-            "time_since_lift",
-            "float",
-            "s from the lift to the end of the episode; null without a lift",
-            is_optional=True,
-        ),
+        TIME_SINCE_LIFT,
         ResultColumn(
             "closest_distance",
             "float",

@@ -272,7 +272,7 @@ class FeedingEnv(FaceEnv):
     def cube_offset(self) -> NDArray[np.float64]:
         """(3,) m: centre of the cube from the mouth, see ``from_mouth``."""
         axes = self.data.site_xmat[self._mouth_site].reshape(3, 3)
-        return from_mouth(self.cube_position, self.mouth_track[0], axes)
+        return from_mouth(self.cube_position, self.mouth_position, axes)
 
     @property
     def utensil_position(self) -> NDArray[np.float64]:
@@ -321,7 +321,7 @@ class FeedingEnv(FaceEnv):
         return {
             "is_success": progress.is_success,
             "is_success_strict": progress.is_success_strict,
-            "mouth_position": self.mouth_track[0],
+            "mouth_position": self.mouth_position,
             "gripper_position": self.gripper_position,
             "utensil_position": self.utensil_position,
             "cube_offset": self.cube_offset,
@@ -353,7 +353,7 @@ class FeedingEnv(FaceEnv):
         return is_inside_mouth(self.cube_offset, half_width, half_height)
 
     def _measure(self) -> StepMeasurements:
-        mouth, utensil = self.mouth_track[0], self.utensil_position
+        mouth, utensil = self.mouth_position, self.utensil_position
         is_on_spoon = self.meal is not None and self.meal.is_on_spoon(self.data)
         return StepMeasurements(
             time=self.time,

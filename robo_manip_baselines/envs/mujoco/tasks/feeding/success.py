@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.envs.mujoco.tasks.lift import LiftProgress
+
 MOUTH_TOLERANCE = np.array([0.03, 0.01, 0.01])
 """m along world x (the face normal), y and z; the spatial condition of Algorithm 1, line 10."""
 
@@ -68,7 +70,7 @@ class StepMeasurements:
 
 
 @dataclass(frozen=True)
-class FeedingProgress:
+class FeedingProgress(LiftProgress):
     """Events of an episode so far; ``advance`` returns the next.
 
     Attributes:
@@ -82,33 +84,15 @@ class FeedingProgress:
     """
 
     phase: Phase = Phase.REACH
-    lift_time: float | None = None
-    success_time: float | None = None
     release_time: float | None = None
     touched_face: bool = False
     released_inside: bool = False
     is_clear: bool = False
 
     @property
-    def is_success(self) -> bool:
-        """Algorithm 1's spatial condition has been met with the cube held."""
-        return self.success_time is not None
-
-    @property
     def is_success_strict(self) -> bool:
         """The cube was let go inside the mouth opening and the gripper never touched the face."""
         return self.is_success and self.released_inside and not self.touched_face
-
-    @property
-    def completion_time(self) -> float | None:
-        """s from the lift to the first success; None before (paper, Table V)."""
-        if self.success_time is None or self.lift_time is None:
-            return None
-        return self.success_time - self.lift_time
-
-    def time_since_lift(self, time: float) -> float | None:
-        """s since the lift; None before."""
-        return None if self.lift_time is None else time - self.lift_time
 
     def advance(self, step: StepMeasurements) -> FeedingProgress:
         """Take in the measurements of one control step."""

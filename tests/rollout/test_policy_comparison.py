@@ -1,0 +1,90 @@
+"""The comparison of policies: what is done is read, and rates are over training seeds."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from robo_manip_baselines.rollout.results import RESULTS, EpisodeResult, Proportion
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import write_json
+
+
+@pytest.fixture(scope="module")
+def policies(repository: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("policies", repository / "benchmarks/policies.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where a dataclass looks up its annotations
+    spec.loader.exec_module(module)
+    return module
+
+
+def result(policy: str, train_seed: int, seed: int, *, is_success: bool) -> EpisodeResult:
+    times = 4.0 if is_success else None
+    failure = "" if is_success else "never_grasped"
+    names = "time_since_lift", "closest_distance", "closest_offset", "cube_offset"
+    return EpisodeResult(
+        *("FeedingEnv", seed, is_success, is_success, times, 300, failure, "a clip", "someone"),
+        columns={**dict.fromkeys(names), "face_force": 0.0},
+        policy=policy,
+        condition="current_pred_h2",
+        train_seed=train_seed,
+    )
+
+
+def write(policies: ModuleType, out: Path, policy: str, train_seed: int, wins: set[int]) -> None:
+    """Ten episodes, of which those of some seeds succeed."""
+    seeds = range(1000, 1010)
+    results = [result(policy, train_seed, s, is_success=s in wins) for s in seeds]
+    share = Proportion.of(len(wins), 10)
+    row = policies.Row(
+        *(policy, "default", train_seed, 1000, 60.0 + train_seed, (3.0, 0.5)),
+        *(share, share, None, 10),
+    )
+    (out / "rows").mkdir(parents=True, exist_ok=True)
+    write_json(out / "rows" / f"{row.name}.json", asdict(row))
+    folder = out / "episodes" / row.name
+    folder.mkdir(parents=True)
+    lines = "".join(f"{x.to_line()}\n" for x in results)
+    (folder / RESULTS).write_text(lines, encoding="utf-8")
+
+
+def test_rates_are_over_training_seeds_and_differences_are_paired(
+    policies: ModuleType, tmp_path: Path
+) -> None:
+    first, half = set(range(1000, 1009)), set(range(1000, 1005))
+    for seed in (0, 1):
+        write(policies, tmp_path, "Act", seed, first)
+        write(policies, tmp_path, "Flow", seed, half)
+    page = policies.page(tmp_path)
+    act, flow = (line for line in page.splitlines() if line.count("|") > 10 and "default" in line)
+    assert act.startswith("| Act | default | 2 | 10 | 90 (")
+    assert flow.startswith("| Flow | default | 2 | 10 | 50 (")
+    # 4 of 10 seeds in each of two trainings: 8 pairs, all to the first policy.
+    assert "| -40 (" in flow
+    assert f"| {2 * 0.5**8:.2g} | 1,000 | 60 | 3.0 | 0.5 |" in flow
+    assert "| Flow | default | 1 | 10 | 50 (24 to 76) | 50 (24 to 76) | - |" in page
+
+
+def test_what_is_done_is_not_done_again(policies: ModuleType, tmp_path: Path) -> None:
+    write(policies, tmp_path, "Mlp", 3, {1000})
+    options = policies.Options(tmp_path / "none", policies=("Mlp",), num_episodes=10, out=tmp_path)
+    row = policies.run(options, "Mlp", "default", 3)
+    assert (row.success.count, row.parameters, row.milliseconds) == (1, 1000, (3.0, 0.5))
+    more = policies.Options(tmp_path / "none", policies=("Mlp",), num_episodes=20, out=tmp_path)
+    with pytest.raises(RequestError, match="none"):  # there are no demonstrations to go on with
+        policies.run(more, "Mlp", "default", 3)
+
+
+def test_unknown_names_are_refused(policies: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="Sarnn"):
+        policies.Options(tmp_path, policies=("Sarn",))
+    with pytest.raises(RequestError, match="forecast_both_now"):
+        policies.Options(tmp_path, observations=("forecast_both",))
