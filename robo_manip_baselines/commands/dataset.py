@@ -174,7 +174,7 @@ class Compare:
     Attributes:
         one: An episode_*.hdf5 file.
         other: Another one.
-        columns: Most columns of an array to list; 0 for all.
+        columns: Most columns of an array to list, those that differ most; 0 for all.
     """
 
     one: Annotated[Path, tyro.conf.arg(metavar="FILE"), tyro.conf.Positional]
@@ -287,7 +287,8 @@ def comparison_text(found: EpisodeComparison, names: tuple[str, str], columns: i
         rows = [("array", "column", "first step", "steps", "max", "rms", "unit")]
         for name, group in itertools.groupby(found.columns, key=lambda item: item.field):
             items = list(group)
-            listed = items[:columns] if columns else items
+            cut = columns and len(items) > columns
+            listed = sorted(items, key=lambda i: -i.largest)[:columns] if cut else items
             rows += [_column_row(item) for item in listed]
             if len(items) > len(listed):
                 rows.append((name, f"… {len(items) - len(listed)} more", *[""] * 5))
@@ -312,7 +313,7 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _short(value: Any) -> str:
-    text = str(value)
+    text = " ".join(str(value).split())
     return text if len(text) <= 60 else f"{text[:60]}…"
 
 

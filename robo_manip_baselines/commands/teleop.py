@@ -16,6 +16,7 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.spec import ImageSize
+from robo_manip_baselines.runs.browser import PageOptions
 from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError, require_printable
 from robo_manip_baselines.runs.progress import closing_table
@@ -30,7 +31,7 @@ Example: python bin/Teleop.py FeedingEnv --device replay --episodes dataset/Feed
 
 DESCRIPTION = "Steer the arms by hand, and record demonstrations."
 
-DEFAULT_DEVICE = "replay"
+DEFAULT_DEVICE = "web"
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,29 @@ class ReplayOptions:
 
 
 @dataclass(frozen=True)
+class SharedOptions:
+    """A policy that acts until the person takes over.
+
+    Attributes:
+        policy: Policy that acts, for example Act.
+        checkpoint: Folder of a training run, or of one of its checkpoints; or shipped:baseline,
+            shipped:current, shipped:forecast, which come with the package.
+        policy_device: Device of the network: auto, cpu, cuda or cuda:1.
+    """
+
+    policy: str | None = None
+    checkpoint: Path | None = None
+    policy_device: str = "cpu"
+
+
+@dataclass(frozen=True)
 class TeleopOptions:
     """Options of the command.
 
     Attributes:
         env: Task, for example FeedingEnv.
-        device: Device of the person: replay, which plays recorded episodes back as a person would.
+        device: Device of the person: web, a page in the browser; or replay, which plays recorded
+            episodes back as if a person did it.
         arm: Arms that the person steers: right, left or both; if not given, those of the task.
         out: Folder of the episodes; if not given, dataset/teleop/<env>.
         num_episodes: Episodes, one for each seed from --seed on that has none yet.
@@ -83,6 +101,8 @@ class TeleopOptions:
         motion_library: File of recorded face motion, or extended, which ships, too.
         images: Images of the episodes.
         replay: Only with --device replay.
+        page: Only with --device web.
+        shared: A policy that acts until the person takes over.
     """
 
     env: tyro.conf.Positional[str]
@@ -101,6 +121,8 @@ class TeleopOptions:
     motion_library: Path | None = None
     images: tyro.conf.OmitArgPrefixes[ImageOptions] = field(default_factory=ImageOptions)
     replay: tyro.conf.OmitArgPrefixes[ReplayOptions] = field(default_factory=ReplayOptions)
+    page: tyro.conf.OmitArgPrefixes[PageOptions] = field(default_factory=PageOptions)
+    shared: tyro.conf.OmitArgPrefixes[SharedOptions] = field(default_factory=SharedOptions)
 
     def __post_init__(self) -> None:
         require_printable("--operator", self.operator)
@@ -117,8 +139,8 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
     task, images = task_entry(options.env), options.images
     if options.replay.episodes and options.device != "replay":
         raise RequestError("--episodes goes with --device replay; leave it out")
-    spec = ObservationSpec(cameras=images.cameras, image_size=images.image_size)
     limit = options.time_limit
+    spec = ObservationSpec(cameras=images.cameras, image_size=images.image_size)
     return TeleopConfig(
         env=options.env,
         out=options.out or Path("dataset") / "teleop" / options.env,
@@ -134,6 +156,10 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
         quality=images.image_quality,
         env_kwargs=face_arguments(options),
         episodes=options.replay.episodes,
+        page=options.page,
+        policy=options.shared.policy,
+        checkpoint=options.shared.checkpoint,
+        policy_device=options.shared.policy_device,
     )
 
 

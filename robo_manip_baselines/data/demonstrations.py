@@ -141,6 +141,8 @@ class Demonstrations:
         env_kwargs: what the environment was made with, but for what ``spec`` says.
         content_hash: SHA-256 over the content hashes of the files, in order, each of which was
             compared with what the file holds.
+        intervention: (sum T,) bool, whether a person chose the action instead of the policy, False
+            in episodes without a policy; None where there is no other.
     """
 
     paths: tuple[Path, ...]
@@ -156,6 +158,7 @@ class Demonstrations:
     xml_hash: str
     env_kwargs: Mapping[str, Any]
     content_hash: str
+    intervention: NDArray[np.bool_] | None = None
 
     def rows(self, episodes: Sequence[int]) -> NDArray[np.int64]:
         """Return the rows of the episodes of these indices, in their order."""
@@ -215,6 +218,8 @@ def load_demonstrations(
     states: list[NDArray[np.float32]] = []
     actions: list[NDArray[np.float32]] = []
     attributes: list[dict[str, Any]] = []
+    interventions: list[NDArray[np.bool_]] = []
+    has_interventions = False
     for path in paths:
         with EpisodeReader(path) as episode:
             attributes.append(episode.attributes)
@@ -228,6 +233,10 @@ def load_demonstrations(
                 target = pipeline.observe_episode(state, attributes[-1]["seed"])
             states.append(spec.pack(state, target))
             actions.append(episode.array("action").astype(np.float32))
+            is_shared = "intervention" in episode.fields
+            has_interventions = has_interventions or is_shared
+            marked = episode.array("intervention") if is_shared else np.zeros(len(episode), bool)
+            interventions.append(marked)
     lengths = np.array([len(action) for action in actions], dtype=np.int64)
     hashes = "\n".join(item["content_sha256"] for item in attributes)
     first = attributes[0]
@@ -245,6 +254,7 @@ def load_demonstrations(
         xml_hash=first["xml_hash"],
         env_kwargs=_world(first),
         content_hash=hashlib.sha256(hashes.encode()).hexdigest(),
+        intervention=np.concatenate(interventions) if has_interventions else None,
     )
 
 

@@ -32,6 +32,8 @@ class Batch:
             gradients whose average over the processes is the gradient of the whole batch's mean.
         num_examples: () float32, examples of the whole batch divided by the number of processes,
             to be used likewise for averages over examples.
+        weight: (B, K) float32, factor of each action's error, with a mean of 1 over the steps of
+            the whole batch that are not padding; None for 1 everywhere.
     """
 
     state: Tensor
@@ -41,6 +43,11 @@ class Batch:
     noise: Tensor
     num_valid: Tensor
     num_examples: Tensor
+    weight: Tensor | None = None
+
+    def weighted(self, error: Tensor) -> Tensor:
+        """Return the errors (B, K, A) of actions, times the weights of their steps."""
+        return error if self.weight is None else error * self.weight[..., None]
 
 
 class PolicyModel(nn.Module):

@@ -6,7 +6,7 @@ Nothing heavy is imported here, so that ``--help`` needs no PyTorch.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from annotated_types import Interval
@@ -85,6 +85,9 @@ class TrainSettings:
             not it has reached the target.
         action_noise: standard deviation of the Gaussian noise that is added, in training, to the
             actions, in units of each element's own (RoboManipBaselines: ``--action_aug_std``).
+        intervention_weight: factor of the error of actions that a person chose instead of the
+            policy (`intervention` of the episodes), before weights are scaled to a mean of 1 over a
+            batch; 1 weights all actions the same. Held-out losses are not weighted.
         augment: random changes to the images in training: ``shift``, ``shift+colour`` (also
             contrast, brightness and tint) or ``none``.
         augment_shift: largest shift as a proportion of the images' sides (robomimic crops 76 of 84
@@ -122,6 +125,7 @@ class TrainSettings:
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
     action_noise: Amount = 0.0
+    intervention_weight: Annotated[float, Interval(gt=0.0, le=1e6)] = 1.0
     augment: str = "none"
     augment_shift: Fraction = 0.04
     validation_fraction: Fraction = 0.2
@@ -246,3 +250,7 @@ STATE_ONLY_TRAINING = TrainSettings(
     ema_decay=0.999,
 )
 """Training of policies without images, minutes on two cores; ``docs/act.md`` has the ablations."""
+
+IMAGE_TRAINING = replace(STATE_ONLY_TRAINING, augment="shift", augment_shift=0.02)
+"""The same with images, on a processor without a GPU: a few pixels of shift, with which a small
+network found mouths more exactly in demonstrations that it had not seen."""

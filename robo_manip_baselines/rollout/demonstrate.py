@@ -122,11 +122,15 @@ class EpisodeRecorder:
     def before(
         self, observation: Mapping[str, NDArray[Any]], action: NDArray[Any], **columns: Any
     ) -> None:
-        """Take in the state before a step, the action, and values of further columns."""
+        """Take in the state before a step, the action, and values of further columns.
+
+        Cameras that the observation does not show are left out.
+        """
         for name, value in (*episode_row(self._world).items(), *columns.items()):
             self._rows[name].append(value)
         self._rows["action"].append(action)
-        for key, camera in self._cameras.items():
+        shown = {key: camera for key, camera in self._cameras.items() if key in observation}
+        for key, camera in shown.items():
             self._images[camera].append(encode_image(observation[key], self._codec, self._quality))
 
     def after(self, info: dict[str, Any]) -> None:

@@ -170,6 +170,8 @@ def serve_page(options: PageOptions, label: str) -> Iterator[tuple[viser.ViserSe
         def request_share_url(self, verbose: bool = True) -> str | None:
             """Refuse what a visitor may ask for: a public address of this page."""
 
+    # It tells of every connection, and of the request that `_require_guarded` makes.
+    logging.getLogger("websockets").setLevel(logging.WARNING)
     _require_free(options)
     logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor
     gate = Gate(options.host, options.secret)

@@ -159,6 +159,7 @@ class TeleopDevice(Protocol):
 
 
 DEVICES: Mapping[str, str] = {
+    "web": "robo_manip_baselines.teleop.web:WebDevice",
     "replay": "robo_manip_baselines.teleop.replay:ReplayDevice",
 }
 """Name of a device -> ``module:class``. The class is made with the arguments that

@@ -48,8 +48,8 @@ class SharedPolicy(Protocol):
         """Start an episode, or go on after a person has acted."""
         ...
 
-    def act(self, observation: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the next action (A,)."""
+    def act(self) -> NDArray[np.float32]:
+        """Return the next action (A,) for the present state of the environment."""
         ...
 
 
@@ -163,7 +163,7 @@ class TeleopSession:
     def _step(self, asked: TeleopInput) -> None:
         """Take one control step: of the person, or of the policy."""
         if self._policy and self._is_policy_acting:
-            action = self._policy.act(self._observation)
+            action = self._policy.act()
             self._arms.take(action)
         else:
             action = self._arms.act(asked.arms, self._steered)
@@ -241,7 +241,7 @@ class TeleopSession:
         self._mode = Mode.REVIEW
         self._episode_missed, self._episode_rate = self._pace.missed, self._pace.mean_rate
         result = "success" if self._info["is_success"] else "no success"
-        self._message = f"the episode has ended: {result}; save it, discard it, or do it again"
+        self._message = f"the episode has ended: {result}; save, redo or discard it"
 
     def _save(self) -> None:
         assert self._recorder is not None

@@ -14,7 +14,7 @@ from annotated_types import Interval
 from robo_manip_baselines.data import EpisodeReader, list_episodes
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
-from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
     TaskEntry,
     make_env,
@@ -27,6 +27,7 @@ from robo_manip_baselines.rollout.demonstrate import (
     refuse_other_settings,
     require_demonstrations_folder,
 )
+from robo_manip_baselines.runs.browser import PageOptions
 from robo_manip_baselines.runs.documents import as_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import locked
@@ -36,6 +37,7 @@ from robo_manip_baselines.teleop.device import DEVICES, TeleopDevice, make_devic
 from robo_manip_baselines.teleop.recording import EpisodeStore, free_seeds
 from robo_manip_baselines.teleop.replay import ReplayDevice
 from robo_manip_baselines.teleop.session import SessionSummary, TeleopSession
+from robo_manip_baselines.teleop.shared import CheckpointPolicy, read_shared
 
 STEERED: Mapping[str, tuple[str, ...]] = {
     "right": ("right",),
@@ -60,6 +62,9 @@ class TeleopConfig:
         cameras, image_size, codec, quality: of the recorded images.
         env_kwargs: further arguments of the environment.
         episodes: files, or folders of them, for the device ``replay``.
+        page: address of the page of the device ``web``.
+        policy, checkpoint: policy that acts until the person takes over; None for none.
+        policy_device: of its network.
 
     Raises:
         RequestError: a value is not valid.
@@ -79,11 +84,20 @@ class TeleopConfig:
     quality: Quality = DEFAULT_QUALITY
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     episodes: tuple[Path, ...] = ()
+    page: PageOptions = field(default_factory=PageOptions)
+    policy: str | None = None
+    checkpoint: Path | None = None
+    policy_device: str = "cpu"
 
     def __post_init__(self) -> None:
         require_choice("device", self.device, DEVICES)
         require_choice("arm", self.arm, STEERED)
         require_choice("image codec", self.codec, CODECS)
+        if (self.policy is None) != (self.checkpoint is None):
+            raise RequestError(
+                "--policy and --checkpoint: a policy that shares control needs both, for example "
+                "--policy Act --checkpoint shipped:forecast"
+            )
         require_ranges(self)
 
     @property
@@ -119,9 +133,18 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
     if config.cameras and (problem := opengl_problem()):
         raise RequestError(f"--cameras {' '.join(config.cameras)}: {problem}; or --cameras none")
     require_demonstrations_folder(config.out)
-    live = {**kwargs, "cameras": (), "disable_env_checker": True}
+    checkpoint = None
+    live: dict[str, Any] = {**kwargs, "cameras": ()}
+    if config.policy and config.checkpoint:
+        checkpoint = read_shared(config.policy, config.checkpoint, config.env)
+        if checkpoint.spec.cameras and (problem := opengl_problem()):
+            raise RequestError(f"{problem} (the policy sees images)")
+        live |= checkpoint.spec.env_kwargs()
+    live["disable_env_checker"] = True  # it would miss the images that are not drawn
     with contextlib.closing(make_env(config.env, **live)) as env:
         world = world_of(env)
+        world.renders_images = False
+        policy = checkpoint and CheckpointPolicy(checkpoint, world, config.policy_device)
         wanted = {
             "env_id": config.task.env_id,
             "env_kwargs": kwargs,
@@ -132,7 +155,7 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
         }
         refuse_other_settings(config.out, wanted)
         refuse_other_settings(config.out / "unrendered", wanted)
-        device = open_device(config, kwargs)
+        device = open_device(config, kwargs, world)
         with (
             contextlib.closing(device),
             locked(config.out, is_kept=False),
@@ -150,18 +173,20 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
                 step_limit=config.step_limit or config.task.max_episode_steps,
                 codec=config.codec,
                 quality=config.quality,
+                policy=policy or None,
             )
             summary = session.run()
             store.finish()
     return summary
 
 
-def open_device(config: TeleopConfig, kwargs: Mapping[str, Any]) -> TeleopDevice:
+def open_device(config: TeleopConfig, kwargs: Mapping[str, Any], world: FaceEnv) -> TeleopDevice:
     """Open the device of a session.
 
     Args:
         config: of the session.
         kwargs: arguments of the environment, as files have them.
+        world: the environment, unwrapped.
 
     Raises:
         RequestError: it cannot be opened, or does not go with the rest; says what to do.
@@ -171,6 +196,16 @@ def open_device(config: TeleopConfig, kwargs: Mapping[str, Any]) -> TeleopDevice
         for path in paths:
             _require_same_world(path, config, kwargs)
         return make_device("replay", episodes=paths, arms=config.steered)
+    if config.device == "web":
+        shown = config.cameras or (() if opengl_problem() else CAMERAS)
+        return make_device(
+            "web",
+            world=world,
+            arms=config.steered,
+            has_policy=config.policy is not None,
+            cameras=shown,
+            page=config.page,
+        )
     return make_device(config.device, arms=config.steered)
 
 

@@ -226,12 +226,13 @@ class BatchLoader:
         skip: control steps between two actions of a chunk, and between observations of a window.
         state_noise: added to states; None for no noise.
         action_noise: standard deviation of the noise that is added to normalised actions.
+        intervention_weight: of the error of actions that a person chose instead of the policy.
         images: None without cameras. Not closed by the loader.
         augment: random changes to the images; None for none.
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
     Raises:
-        RequestError: more processes than examples in a batch.
+        RequestError: more processes than examples in a batch, or a weight without interventions.
         ValueError: arguments that do not fit one another.
     """
 
@@ -251,6 +252,7 @@ class BatchLoader:
         skip: int = 1,
         state_noise: StateNoise | None = None,
         action_noise: float = 0.0,
+        intervention_weight: float = 1.0,
         images: ImageStore | None = None,
         augment: ImageAugmentation | None = None,
         depth: int = 4,
@@ -278,6 +280,16 @@ class BatchLoader:
         if self._encoding:
             action = self._encoding.columns(action).astype(np.float32)
         self._action = normalization.normalize_action(action)
+        self._weight: NDArray[np.float32] | None = None
+        if intervention_weight != 1.0:
+            if demonstrations.intervention is None:
+                raise RequestError(
+                    f"intervention_weight {intervention_weight:g}: no episode of "
+                    f"'{demonstrations.paths[0].parent}' has the steps of interventions marked; "
+                    "record some with bin/Teleop.py --policy, or leave it out"
+                )
+            marked = demonstrations.intervention[self._rows]
+            self._weight = np.where(marked, intervention_weight, 1.0).astype(np.float32)
         self._images = images
         self._augmentation = augment
         self._device = torch.device(device)
@@ -344,7 +356,17 @@ class BatchLoader:
             noise=noise[part],
             num_valid=torch.tensor(float((~is_pad).sum()) / self._world_size),
             num_examples=torch.tensor(count / self._world_size),
+            **self._weights(chunks, is_pad, part),
         )
+
+    def _weights(
+        self, chunks: NDArray[np.int64], is_pad: NDArray[np.bool_], part: slice
+    ) -> dict[str, Tensor]:
+        """Return ``weight`` of a process's part of a batch; nothing where all weigh the same."""
+        if self._weight is None:
+            return {}
+        weight = self._weight[chunks]
+        return {"weight": torch.from_numpy(weight / weight[~is_pad].mean())[part]}
 
     def _action_change(
         self, step: int, part: slice, rows: NDArray[np.int64], state_noise: Tensor | None

@@ -245,6 +245,7 @@ class Trainer:
             skip=settings.skip,
             state_noise=noise,
             action_noise=settings.action_noise,
+            intervention_weight=settings.intervention_weight,
             images=images,
             augment=augment,
         )

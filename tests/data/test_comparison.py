@@ -114,10 +114,12 @@ def test_images_and_fields_that_one_lacks(original: Path, tmp_path: Path) -> Non
 def test_long_lists_are_cut(original: Path, tmp_path: Path) -> None:
     arrays = make_arrays(STEPS)
     arrays["qpos"] = arrays["qpos"] + 1.0
+    arrays["qpos"][:, 17] += 1.0
     found = compared(original, write(tmp_path / "b", arrays))
     assert len(found.columns) == arrays["qpos"].shape[1]
     lines = comparison_text(found, ("a", "b"), columns=3).splitlines()
     assert sum(line.startswith("qpos") for line in lines) == 4
+    assert lines[1].split()[1] == "17"  # the largest difference
     assert "… 20 more" in lines[4]
     whole = comparison_text(found, ("a", "b"), columns=0)
     assert whole.count("qpos") == len(found.columns)

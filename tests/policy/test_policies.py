@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import pytest
 import torch
@@ -150,3 +151,23 @@ def test_training_lowers_the_loss_of_a_batch(policy: str) -> None:
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.5 * losses[0]
+
+
+@every_policy
+def test_weights_multiply_the_errors_of_their_steps(policy: str) -> None:
+    model, dims = make(policy)
+    model.eval()  # without dropout
+    batch = make_batch(model, dims)
+
+    def error(weight: torch.Tensor | None) -> float:
+        parts = model.loss(replace(batch, weight=weight))
+        return parts.get("l1", parts["loss"]).item()
+
+    ones = torch.ones(batch.is_pad.shape)
+    assert error(None) == error(ones)
+    assert error(3.0 * ones) == pytest.approx(3.0 * error(ones), rel=1e-5)
+    # What the two halves of the steps contribute adds up.
+    chosen = torch.rand(ones.shape, generator=torch.Generator().manual_seed(2)) < 0.5
+    halves = error(chosen.float()), error((~chosen).float())
+    assert sum(halves) == pytest.approx(error(ones), rel=1e-5)
+    assert min(halves) > 0.0

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Interval
 
 from robo_manip_baselines.policy.presets import (
+    IMAGE_TRAINING,
     STATE_ONLY_TRAINING,
     ActionExecution,
     Chunk,
@@ -153,9 +154,7 @@ PRESETS = {
     ),
     "cpu_images": PolicyPreset(
         config=replace(_SMALL, vision="small"),
-        training=replace(
-            STATE_ONLY_TRAINING, batch_size=16, steps=12000, augment="shift", augment_shift=0.02
-        ),
+        training=replace(IMAGE_TRAINING, batch_size=16, steps=12000),
         # Images are drawn and encoded for every tenth step only.
         execution=ActionExecution(temporal_ensemble=False, n_action_steps=10),
         image_size=(96, 128),

@@ -363,7 +363,7 @@ class ActModel(PolicyModel):
             latent = mean + (0.5 * log_variance).exp() * batch.noise
             kl = kl_divergence(mean, log_variance).sum() / batch.num_examples
         actions = self._actions(batch.state, batch.images, latent)
-        error = nn.functional.l1_loss(actions, action, reduction="none")
+        error = batch.weighted(nn.functional.l1_loss(actions, action, reduction="none"))
         if self.config.paper_compat:
             kept = error.masked_fill(batch.is_pad[..., None], 0.0)
             l1 = kept.sum() / (batch.num_examples * kept[0].numel())

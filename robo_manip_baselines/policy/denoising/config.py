@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from annotated_types import Interval
 
 from robo_manip_baselines.policy.presets import (
+    IMAGE_TRAINING,
     STATE_ONLY_TRAINING,
     ActionExecution,
     Chunk,
@@ -163,7 +164,7 @@ def denoising_presets(
         ),
         "cpu_images": PolicyPreset(
             config=kind(**_SMALL),
-            training=STATE_ONLY_TRAINING,
+            training=IMAGE_TRAINING,
             execution=execution,
             cameras=("angle", "front_close"),
             image_size=(60, 80),

@@ -174,7 +174,7 @@ class ImageEncoder(nn.Module):
     """Image features as coordinates of keypoints: convolutions, then a spatial softmax.
 
     The ResNet-18 is ACT's, whose normalisation is frozen, in place of the group normalisation of
-    Chi et al.; images are not cropped at random.
+    Chi et al.; to shift images at random is an option of the training.
     """
 
     mean: Tensor
@@ -335,6 +335,7 @@ def filled(batch: Batch) -> Tensor:
     return torch.where(batch.is_pad[..., None], batch.action.gather(1, last), batch.action)
 
 
-def squared_error(found: Tensor, wanted: Tensor, num_examples: Tensor) -> Tensor:
-    """Return the mean squared error over all steps of (B, K, A)."""
-    return (found - wanted).square().sum() / (num_examples * math.prod(found.shape[1:]))
+def squared_error(found: Tensor, wanted: Tensor, batch: Batch) -> Tensor:
+    """Return the mean squared error over all steps of (B, K, A), with the weights of the batch."""
+    error = batch.weighted((found - wanted).square())
+    return error.sum() / (batch.num_examples * math.prod(found.shape[1:]))

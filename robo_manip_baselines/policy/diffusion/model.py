@@ -65,7 +65,7 @@ class DiffusionModel(DenoisingModel):
         observed = self.observe(batch.state, batch.images)
         found = self.found(observed, noisy, level / levels)
         wanted = action if self.finds_action else noise
-        return {"loss": squared_error(found, wanted, batch.num_examples)}
+        return {"loss": squared_error(found, wanted, batch)}
 
     def sample(
         self,

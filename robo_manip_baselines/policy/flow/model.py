@@ -44,7 +44,7 @@ class FlowModel(DenoisingModel):
         wanted = action if self.finds_action else action - noise
         if not self.marks_prefix:
             found = self.found(observed, position, time)
-            return {"loss": squared_error(found, wanted, batch.num_examples)}
+            return {"loss": squared_error(found, wanted, batch)}
         # Each length from 0 to max_prefix is as likely; fixed steps are no error.
         length = torch.special.ndtr(batch.noise[:, size + 1]) * (self.max_prefix + 1)
         steps = torch.arange(self.chunk_size, device=action.device)
@@ -52,7 +52,7 @@ class FlowModel(DenoisingModel):
         position = torch.where(is_fixed[..., None], action, position)
         found = self.found(observed, position, time, is_fixed)
         found = torch.where(is_fixed[..., None], wanted, found)
-        return {"loss": squared_error(found, wanted, batch.num_examples)}
+        return {"loss": squared_error(found, wanted, batch)}
 
     def sample(
         self,

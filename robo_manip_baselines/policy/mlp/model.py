@@ -37,5 +37,5 @@ class MlpModel(PolicyModel):
         """Return the mean absolute error over valid steps as ``loss`` and ``l1``."""
         actions = self.predict(batch.state, batch.images, None)
         error = nn.functional.l1_loss(actions, batch.action, reduction="none")
-        l1 = masked_mean(error, batch.is_pad, batch.num_valid)
+        l1 = masked_mean(batch.weighted(error), batch.is_pad, batch.num_valid)
         return {"loss": l1, "l1": l1}

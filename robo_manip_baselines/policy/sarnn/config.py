@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Interval
 
 from robo_manip_baselines.policy.presets import (
+    IMAGE_TRAINING,
     STATE_ONLY_TRAINING,
     ActionExecution,
     Chunk,
@@ -85,7 +86,7 @@ PRESETS = {
     ),
     "cpu_images": PolicyPreset(
         config=SarnnConfig(chunk_size=30, n_obs_steps=4),
-        training=replace(STATE_ONLY_TRAINING, batch_size=16),
+        training=replace(IMAGE_TRAINING, batch_size=16),
         execution=ActionExecution(temporal_ensemble=False, n_action_steps=8),
         cameras=("angle", "front_close"),
         image_size=(60, 80),

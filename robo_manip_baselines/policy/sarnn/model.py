@@ -61,7 +61,7 @@ class SarnnModel(PolicyModel):
         features = self.features(batch.state, batch.images)
         hidden, _ = self.memory(self.encoder(features))
         error = nn.functional.l1_loss(self.chunk(hidden[:, -1]), batch.action, reduction="none")
-        l1 = masked_mean(error, batch.is_pad, batch.num_valid)
+        l1 = masked_mean(batch.weighted(error), batch.is_pad, batch.num_valid)
         if self.next is None:
             return {"loss": l1, "l1": l1}
         # Detached: the encoder is not to make its keypoints easy to predict.

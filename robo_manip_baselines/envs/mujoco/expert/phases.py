@@ -24,14 +24,14 @@ DOWN = mink.SO3.from_z_radians(np.pi) @ mink.SO3.from_y_radians(np.pi / 2)
 """Gripper pointing straight down, its fingers closing along world y."""
 
 
-def level_at(position: NDArray[np.float64]) -> mink.SO3:
+def level_at(position: NDArray[np.float64], arm: str = "right") -> mink.SO3:
     """Orientation of a level gripper at ``position`` (3,) m, world, pointing away from its base.
 
     Straight in front of the base this is along world -x, into the mouth of a face that looks along
     +x. Elsewhere it turns with the arm: to keep pointing along -x there, the wrist would have to
     work around its singularity, where forearm and gripper are in line.
     """
-    away = position - np.array(ARM_BASES["right"][0])
+    away = position - np.array(ARM_BASES[arm][0])
     return mink.SO3.from_z_radians(float(np.arctan2(away[1], away[0])))
 
 
