@@ -167,17 +167,17 @@ def play(world: FaceEnv, condition: str, seed: int) -> Row:
         bool(info["is_success_strict"]),
         info["completion_time"],
         failure,
-        force,
+        round(force, 3),
         world.step_count,
         camera.frames if camera else None,
         world.frames_without_detection,
         tuple(
             Errors(int(n), int(m), tuple(s.tolist()), tuple(a.tolist()))
-            for n, m, s, a in zip(steps, unseen, seen, aim, strict=True)
+            for n, m, s, a in zip(steps, unseen, seen.round(9), aim.round(9), strict=True)
         ),
-        world.step_count / taken,
-        float(np.median(latencies)) if latencies else None,
-        world.step_count / worked,
+        round(world.step_count / taken, 1),
+        round(float(np.median(latencies)), 4) if latencies else None,
+        round(world.step_count / worked, 1),
     )
 
 

@@ -252,7 +252,7 @@ def open_tracker(fov: float, horizon: int) -> MouthTracker:
     from face_prediction.models.loading import SHIPPED, load_predictor
     from face_prediction.models.residual.predictor import ResidualPredictor
 
-    model = find_model(None)
+    model = find_model(None, option=None)
     try:
         predictor, record = load_predictor(SHIPPED)
     except ImportError as error:

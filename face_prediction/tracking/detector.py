@@ -48,11 +48,11 @@ def find_model(
     given: Path | None,
     url: str = MODEL_URL,
     expected: str = MODEL_SHA256,
-    option: str = "--detector_model",
+    option: str | None = "--detector_model",
 ) -> Path:
     """The model to use: ``given`` if named, else the cached one, downloaded once if absent.
 
-    ``option`` is the one that names a model in the command that asks.
+    ``option`` is the one that names a model in the command that asks, None where it has none.
 
     Raises:
         RequestError: the named file is absent, or the cached one is damaged or absent and cannot
@@ -76,7 +76,8 @@ def find_model(
     except OSError as error:  # URLError is one
         raise RequestError(
             f"no model at {path} and none could be downloaded ({getattr(error, 'reason', error)}); "
-            f"on a machine with a network fetch {url}, then put it there or name it with {option}"
+            f"on a machine with a network fetch {url}, then put it there"
+            + (f" or name it with {option}" if option else "")
         ) from None
     found = hashlib.sha256(data).hexdigest()
     if found != expected:
@@ -86,7 +87,8 @@ def find_model(
             temporary.write_bytes(data)
     except (OSError, RequestError) as error:
         raise RequestError(
-            f"{path}: cannot be written ({error}); name a model with {option}"
+            f"{path}: cannot be written ({error})"
+            + (f"; name a model with {option}" if option else "")
         ) from None
     return path
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from face_prediction.live.mouth import MouthTracker
 from face_prediction.live.streaming import LiveForecast
+from face_prediction.tracking import detector
 from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
@@ -296,6 +297,13 @@ def test_wrong_requests_are_refused(kwargs: dict[str, Any], message: str) -> Non
 def test_a_missing_tracker_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_mouth, "TRACKER", "no_such_package.mouth:open_tracker")
     with pytest.raises(RequestError, match="mouth_source camera: its tracker cannot be imported"):
+        make_env("FeedingEnv", **BLIND, mouth_source="camera")
+
+
+def test_a_missing_model_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(detector.find_model, "__defaults__", ("http://localhost:9/none", "", None))
+    with pytest.raises(RequestError, match=r"no model at .* then put it there$"):
         make_env("FeedingEnv", **BLIND, mouth_source="camera")
 
 
