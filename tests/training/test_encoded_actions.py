@@ -32,6 +32,8 @@ POLICIES = {
     "Sarnn": "--chunk_size 4 --hidden_size 8 --n_obs_steps 3",
     "Diffusion": "--chunk_size 4 --hidden_size 16 --num_layers 1",
     "Flow": "--chunk_size 4 --hidden_size 16 --num_layers 1",
+    "Flow with a camera": "--chunk_size 4 --hidden_size 16 --num_layers 1 --cameras top "
+    "--image_size 24x32 --keypoints 4",
 }
 MOUTH = "--mouth_frame both --mouth_time forecast --horizon 3 --relative"
 
@@ -61,7 +63,7 @@ def configure(line: str, episodes: Path, out: Path) -> Any:
 def test_every_policy_learns_them_and_its_checkpoint_says_so(
     policy: str, episodes: Path, tmp_path: Path
 ) -> None:
-    line = f"{policy} {POLICIES[policy]} {MOUTH} --skip 2"
+    line = f"{policy.split()[0]} {POLICIES[policy]} {MOUTH} --skip 2"
     assert train(configure(line, episodes, tmp_path / "run")) == 0
     checkpoint = read_checkpoint(tmp_path / "run")
     assert (checkpoint.spec.mouth_frame, checkpoint.spec.mouth_time) == ("both", "forecast")
@@ -72,7 +74,8 @@ def test_every_policy_learns_them_and_its_checkpoint_says_so(
     runner = PolicyRunner(load_model(checkpoint), *facts, **coding, num_envs=2)
     runner.reset(np.arange(2), [0, 1])
     vectors = np.zeros((2, checkpoint.dims.state), np.float32)
-    assert np.isfinite(runner.act(vectors, None, np.arange(2))).all()
+    images = np.zeros((2, 1, 24, 32, 3), np.uint8) if checkpoint.dims.cameras else None
+    assert np.isfinite(runner.act(vectors, images, np.arange(2))).all()
 
 
 @pytest.mark.parametrize(
