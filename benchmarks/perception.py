@@ -63,6 +63,8 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 }
 """Name -> arguments of the environment. ``uniform`` is the paper's injection."""
 
+ENOUGH = 20  # episodes of each for a verdict
+
 DISTANCES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 10.0)
 """m, edges of the classes of distance between gripper and mouth."""
 
@@ -373,13 +375,18 @@ def finding(groups: dict[str, list[Row]]) -> str:
         return ""
     injected, seen = (_rms(groups[name], "aim", near) for name in ("uniform", "camera"))
     wrong = [100.0 * np.mean([not r.is_success for r in groups[n]]) for n in ("uniform", "camera")]
-    stands = seen[0] < 2 * injected[0] and abs(wrong[1] - wrong[0]) < 10
+    episodes = [len(groups[name]) for name in ("uniform", "camera")]
+    verdict = "Too few episodes to say whether the injected error stands for the real thing."
+    if min(episodes) >= ENOUGH:
+        stands = seen[0] < 2 * injected[0] and abs(wrong[1] - wrong[0]) < 10
+        does = "stands" if stands else "does not stand"
+        verdict = f"The injected error {does} for the real thing."
     return (
-        f"{len(groups['camera'])} episodes with the camera, {len(groups['uniform'])} without. "
+        f"Episodes with the injected error: {episodes[0]}; with the camera: {episodes[1]}. "
         f"With the paper's injected error the servo's aim is off by {injected[0]:.1f} mm across "
         f"the view and {injected[1]:.1f} mm along it, and {wrong[0]:.0f} % of the episodes fail; "
-        f"with the camera by {seen[0]:.1f} and {seen[1]:.1f} mm, and {wrong[1]:.0f} % fail. The "
-        f"injected error {'stands' if stands else 'does not stand'} for the real thing."
+        f"with the camera by {seen[0]:.1f} and {seen[1]:.1f} mm, and {wrong[1]:.0f} % fail. "
+        f"{verdict}"
     )
 
 

@@ -232,7 +232,7 @@ class BatchLoader:
         depth: batches made ahead; 0 makes each when it is asked for, without threads.
 
     Raises:
-        RequestError: more processes than examples in a batch, or a weight without interventions.
+        RequestError: more processes than examples in a batch.
         ValueError: arguments that do not fit one another.
     """
 
@@ -283,11 +283,7 @@ class BatchLoader:
         self._weight: NDArray[np.float32] | None = None
         if intervention_weight != 1.0:
             if demonstrations.intervention is None:
-                raise RequestError(
-                    f"intervention_weight {intervention_weight:g}: no episode of "
-                    f"'{demonstrations.paths[0].parent}' has the steps of interventions marked; "
-                    "record some with bin/Teleop.py --policy, or leave it out"
-                )
+                raise ValueError("a weight of interventions without any")
             marked = demonstrations.intervention[self._rows]
             self._weight = np.where(marked, intervention_weight, 1.0).astype(np.float32)
         self._images = images

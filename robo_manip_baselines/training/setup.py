@@ -88,6 +88,12 @@ class TrainSetup:
         given = load_demonstrations(folder, config.spec, limit=config.num_episodes, env=config.env)
         if given.env_id != env_id:
             raise RequestError(f"'{folder}' holds {given.env_id}, not {env_id}")
+        if settings.intervention_weight != 1.0 and given.intervention is None:
+            raise RequestError(
+                f"intervention_weight {settings.intervention_weight:g}: no episode of '{folder}' "
+                "has the steps of interventions marked; record some with bin/Teleop.py --policy, "
+                "or leave it out"
+            )
         split = split_episodes(given.seeds, settings.validation_fraction, seed)
         train = list(given.indices(split.train))
         step = settings.skip * given.control_period

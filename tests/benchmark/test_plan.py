@@ -51,6 +51,13 @@ def keys(made: Plan, kind: str) -> list[str]:
     return [item.key for item in made.items() if item.kind == kind]
 
 
+@pytest.mark.parametrize(("name", "size"), [("cpu_images", [240, 320]), ("paper", [480, 640])])
+def test_the_preset_decides_the_size_of_recorded_images(name: str, size: list[int]) -> None:
+    made = plan(preset=PRESETS[name])
+    recorded = next(item for item in made.items() if item.kind == "demonstrations")
+    assert json.loads(json.dumps(recorded.settings))["config"]["env_kwargs"]["image_size"] == size
+
+
 def test_conditions_share_demonstrations_and_nothing_else() -> None:
     other = changed(name="aim", expert="anticipatory")
     frozen = changed(name="frozen", prediction="persistence")

@@ -385,8 +385,14 @@ def test_vector_environments_give_what_single_ones_give(name: str, mode: str) ->
         ({"motion_library": 5}, "motion_library 5: must be the path of a file"),
         ({"shadows": "yes"}, "shadows 'yes': must be True or False"),
         ({"multisamples": 10**9}, "multisamples 1000000000: must be 0 to 64"),
-        ({"camera": "top"}, "unknown argument 'camera' .*'cameras'.*valid: arms, cameras, clips"),
-        ({"colour": "red"}, "unknown argument 'colour'; valid: arms, cameras, clips"),
+        (
+            {"camera": "top"},
+            "unknown argument 'camera' .*'cameras'.*valid: arms, camera_latency, cameras, clips",
+        ),
+        (
+            {"colour": "red"},
+            "unknown argument 'colour'; valid: arms, camera_latency, cameras, clips",
+        ),
     ],
 )
 def test_bad_arguments_get_one_clear_line(

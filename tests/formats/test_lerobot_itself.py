@@ -29,6 +29,8 @@ pytestmark = pytest.mark.slow
 
 LEROBOT = "lerobot[dataset,evaluation,training]==0.6.1"
 PLUGIN = "lerobot_env_robo_manip_baselines"
+NEEDED = 15_000_000_000
+"""Bytes of disk for pip's downloads and the environment: 6 GB installed, with CUDA's libraries."""
 LENGTHS, SIZE, CAMERAS = (40, 55, 30), (64, 96), ("front_close", "top")
 
 
@@ -58,6 +60,9 @@ def python(repository: Path) -> Path:
     base = new_python()
     if base is None:
         pytest.skip("LeRobot 0.6 needs Python 3.12 or later, and there is none")
+    cache.mkdir(parents=True, exist_ok=True)
+    if (free := shutil.disk_usage(cache).free) < NEEDED:
+        pytest.skip(f"LeRobot needs {NEEDED / 1e9:.0f} GB of disk, and {free / 1e9:.0f} are free")
     plugin = repository / "integrations" / PLUGIN
     for command in (
         [base, "-m", "venv", "--clear", str(folder)],

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from robo_manip_baselines.commands import train
 from robo_manip_baselines.data import episode_path, write_episode
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes
@@ -106,10 +107,20 @@ def test_processes_share_the_weights_of_a_batch(loaded: Demonstrations) -> None:
     assert torch.equal(torch.cat([part for part in parts if part is not None]), whole)
 
 
-def test_a_weight_without_interventions_is_refused(loaded: Demonstrations) -> None:
-    bare = replace(loaded, intervention=None)
+def test_a_weight_without_interventions_is_refused(episodes: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    options = [
+        "--dataset",
+        str(episodes),
+        "--cameras",
+        "none",
+        "--no_object_pose",
+        "--out",
+        str(out),
+    ]
     with pytest.raises(RequestError, match=r"intervention_weight 2: no episode of .*Teleop"):
-        make_loader(bare, intervention_weight=2.0)
+        train.main(["Mlp", *options, "--intervention_weight", "2"])
+    assert not out.exists()
 
 
 def test_the_option_is_kept_in_the_config() -> None:
