@@ -240,8 +240,8 @@ class Display:
 
     def close(self) -> None:
         self._x.XCloseDisplay(self._connection)
-        self.server.terminate()
-        self.server.wait()
+        with self.server as server:  # closes its pipe, and waits
+            server.terminate()
 
 
 @pytest.fixture
