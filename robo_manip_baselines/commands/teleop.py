@@ -12,6 +12,7 @@ import tyro
 from annotated_types import Interval
 
 from robo_manip_baselines.commands.rollout import face_arguments
+from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
@@ -21,6 +22,7 @@ from robo_manip_baselines.runs.command import parse
 from robo_manip_baselines.runs.errors import RequestError, require_printable
 from robo_manip_baselines.runs.progress import closing_table
 from robo_manip_baselines.runs.ranges import Episodes, Quality, Seed
+from robo_manip_baselines.teleop.options import SteeringOptions
 
 if TYPE_CHECKING:
     from robo_manip_baselines.teleop.teleoperate import TeleopConfig
@@ -30,8 +32,6 @@ EXAMPLE = """python bin/Teleop.py FeedingEnv --num_episodes 10 --out dataset/tel
 Example: python bin/Teleop.py FeedingEnv --device replay --episodes dataset/FeedingEnv"""
 
 DESCRIPTION = "Steer the arms by hand, and record demonstrations."
-
-DEFAULT_DEVICE = "web"
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,9 @@ class TeleopOptions:
 
     Attributes:
         env: Task, for example FeedingEnv.
-        device: Device of the person: web, a page in the browser; or replay, which plays recorded
-            episodes back as if a person did it.
+        device: Device of the person: keyboard, in a window of MuJoCo; web, a page in the browser;
+            or replay, which plays recorded episodes back as if a person did it. If not given,
+            keyboard where there is a display, else web.
         arm: Arms that the person steers: right, left or both; if not given, those of the task.
         out: Folder of the episodes; if not given, dataset/teleop/<env>.
         num_episodes: Episodes, one for each seed from --seed on that has none yet.
@@ -102,11 +103,12 @@ class TeleopOptions:
         images: Images of the episodes.
         replay: Only with --device replay.
         page: Only with --device web.
+        steering: Speed of the hand; only with --device keyboard.
         shared: A policy that acts until the person takes over.
     """
 
     env: tyro.conf.Positional[str]
-    device: str = DEFAULT_DEVICE
+    device: str | None = None
     arm: str | None = None
     out: Path | None = None
     num_episodes: Episodes = 50
@@ -122,10 +124,16 @@ class TeleopOptions:
     images: tyro.conf.OmitArgPrefixes[ImageOptions] = field(default_factory=ImageOptions)
     replay: tyro.conf.OmitArgPrefixes[ReplayOptions] = field(default_factory=ReplayOptions)
     page: tyro.conf.OmitArgPrefixes[PageOptions] = field(default_factory=PageOptions)
+    steering: tyro.conf.OmitArgPrefixes[SteeringOptions] = field(default_factory=SteeringOptions)
     shared: tyro.conf.OmitArgPrefixes[SharedOptions] = field(default_factory=SharedOptions)
 
     def __post_init__(self) -> None:
         require_printable("--operator", self.operator)
+
+
+def default_device() -> str:
+    """Return ``keyboard`` where a window can be opened, else ``web``."""
+    return "web" if viewer_problem() else "keyboard"
 
 
 def to_config(options: TeleopOptions) -> TeleopConfig:
@@ -144,7 +152,7 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
     return TeleopConfig(
         env=options.env,
         out=options.out or Path("dataset") / "teleop" / options.env,
-        device=options.device,
+        device=options.device or default_device(),
         arm=options.arm or task.arms[0],
         first_seed=options.seed,
         num_episodes=options.num_episodes,
@@ -157,6 +165,7 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
         env_kwargs=face_arguments(options),
         episodes=options.replay.episodes,
         page=options.page,
+        steering=options.steering,
         policy=options.shared.policy,
         checkpoint=options.shared.checkpoint,
         policy_device=options.shared.policy_device,

@@ -159,6 +159,7 @@ class TeleopDevice(Protocol):
 
 
 DEVICES: Mapping[str, str] = {
+    "keyboard": "robo_manip_baselines.teleop.keyboard:KeyboardDevice",
     "web": "robo_manip_baselines.teleop.web:WebDevice",
     "replay": "robo_manip_baselines.teleop.replay:ReplayDevice",
 }

@@ -34,6 +34,7 @@ from robo_manip_baselines.runs.files import locked
 from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY
 from robo_manip_baselines.runs.ranges import Episodes, Quality, Seed, require_ranges
 from robo_manip_baselines.teleop.device import DEVICES, TeleopDevice, make_device
+from robo_manip_baselines.teleop.options import SteeringOptions
 from robo_manip_baselines.teleop.recording import EpisodeStore, free_seeds
 from robo_manip_baselines.teleop.replay import ReplayDevice
 from robo_manip_baselines.teleop.session import SessionSummary, TeleopSession
@@ -63,6 +64,7 @@ class TeleopConfig:
         env_kwargs: further arguments of the environment.
         episodes: files, or folders of them, for the device ``replay``.
         page: address of the page of the device ``web``.
+        steering: speed of the hand with the device ``keyboard``.
         policy, checkpoint: policy that acts until the person takes over; None for none.
         policy_device: of its network.
 
@@ -85,6 +87,7 @@ class TeleopConfig:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     episodes: tuple[Path, ...] = ()
     page: PageOptions = field(default_factory=PageOptions)
+    steering: SteeringOptions = field(default_factory=SteeringOptions)
     policy: str | None = None
     checkpoint: Path | None = None
     policy_device: str = "cpu"
@@ -196,17 +199,15 @@ def open_device(config: TeleopConfig, kwargs: Mapping[str, Any], world: FaceEnv)
         for path in paths:
             _require_same_world(path, config, kwargs)
         return make_device("replay", episodes=paths, arms=config.steered)
+    given: dict[str, Any] = {"arms": config.steered}
+    if config.device in ("keyboard", "web"):
+        given |= {"world": world, "has_policy": config.policy is not None}
+    if config.device == "keyboard":
+        given["steering"] = config.steering
     if config.device == "web":
-        shown = config.cameras or (() if opengl_problem() else CAMERAS)
-        return make_device(
-            "web",
-            world=world,
-            arms=config.steered,
-            has_policy=config.policy is not None,
-            cameras=shown,
-            page=config.page,
-        )
-    return make_device(config.device, arms=config.steered)
+        given["cameras"] = config.cameras or (() if opengl_problem() else CAMERAS)
+        given["page"] = config.page
+    return make_device(config.device, **given)
 
 
 def _episode_paths(config: TeleopConfig) -> list[Path]:

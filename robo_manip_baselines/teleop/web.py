@@ -11,32 +11,39 @@ import base64
 import contextlib
 import html
 import logging
-import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
-from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.cell.viser_scene import ViserScene
-from robo_manip_baselines.envs.mujoco.expert.phases import DOWN, level_at
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.runs.browser import PageOptions, require_viser, serve_page
 from robo_manip_baselines.runs.images import encode_image
 from robo_manip_baselines.runs.processes import Worker, wait_for
 from robo_manip_baselines.teleop.device import (
-    Floats,
     Mode,
     SessionView,
-    TeleopCommand,
     TeleopEvent,
     TeleopInput,
 )
-from robo_manip_baselines.teleop.goal import Goal
+from robo_manip_baselines.teleop.hand import (
+    MOVES,
+    POSES,
+    TURNS,
+    VIEW_AT,
+    VIEW_FROM,
+    Action,
+    Drag,
+    Hand,
+    Key,
+    Opening,
+    status_rows,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -51,40 +58,8 @@ PREVIEW_SIZE = (180, 240)
 
 PREVIEW_QUALITY = 80
 
-TURN = math.radians(5.0)
-"""rad that a key turns the gripper by."""
-
-TURN_SPEED = 1.5
-"""rad/s, largest angular velocity of the gripper."""
-
 HANDLE_SIZE = 0.16
 """m, length of the axes that can be dragged."""
-
-VIEW_FROM, VIEW_AT = (0.75, -0.45, 0.80), (0.08, 0.5, 0.15)
-"""m, world: first place of the browser's camera, and the point that it looks at."""
-
-MOVES: Mapping[str, tuple[str, Floats]] = {
-    "A": ("left", np.array([-1.0, 0.0, 0.0])),
-    "D": ("right", np.array([1.0, 0.0, 0.0])),
-    "W": ("away", np.array([0.0, 1.0, 0.0])),
-    "S": ("towards you", np.array([0.0, -1.0, 0.0])),
-    "E": ("up", np.array([0.0, 0.0, 1.0])),
-    "Q": ("down", np.array([0.0, 0.0, -1.0])),
-}
-"""Key -> label, and direction along the world's axes."""
-
-TURNS: Mapping[str, tuple[str, Floats]] = {
-    "I": ("tip up", np.array([0.0, -1.0, 0.0])),
-    "K": ("tip down", np.array([0.0, 1.0, 0.0])),
-    "J": ("turn left", np.array([0.0, 0.0, 1.0])),
-    "L": ("turn right", np.array([0.0, 0.0, -1.0])),
-    "U": ("roll left", np.array([-1.0, 0.0, 0.0])),
-    "O": ("roll right", np.array([1.0, 0.0, 0.0])),
-}
-"""Key -> label, and axis of the gripper (x out of it)."""
-
-POSES: Mapping[str, str] = {"X": "point down", "C": "point ahead"}
-"""Key -> label of an orientation."""
 
 EVENTS: Mapping[TeleopEvent, tuple[str, str, str]] = {
     TeleopEvent.RECORD: ("R", "Record", "player-record"),
@@ -113,79 +88,6 @@ COLOURS: Mapping[Mode, str] = {
 """Background of the mode's name."""
 
 
-class Drag(NamedTuple):
-    """A handle was dragged to a pose."""
-
-    arm: str
-    position: Floats
-    orientation: Floats
-
-
-class Key(NamedTuple):
-    """A key of `MOVES`, `TURNS` or `POSES`, or the space bar (``space``)."""
-
-    name: str
-
-
-class Opening(NamedTuple):
-    """The slider of the gripper was moved, 0 closed to 1 open."""
-
-    value: float
-
-
-Action = Drag | Key | Opening | TeleopEvent
-
-
-class Hand:
-    """Goals of the arms that a person sets, without a page.
-
-    Args:
-        arms: that the person steers.
-    """
-
-    def __init__(self, arms: Sequence[str]) -> None:
-        self._arms = tuple(arms)
-        self.goals: dict[str, Goal] = {}
-
-    def follow(self, view: SessionView) -> None:
-        """Let the goals be where the grippers are commanded to be."""
-        self.goals = {arm: Goal.at(view.arms[arm]) for arm in self._arms}
-
-    def take(self, action: Action, view: SessionView, step: float) -> None:
-        """Change a goal as the person asks.
-
-        Args:
-            action: of the person; events change no goal.
-            view: of the session.
-            step: m that a key moves the gripper by.
-        """
-        arm = view.active_arm
-        goal, pose = self.goals[arm], view.arms[arm]
-        if isinstance(action, Drag):
-            dragged = self.goals[action.arm]
-            self.goals[action.arm] = Goal(action.position, action.orientation, dragged.opening)
-        elif isinstance(action, Opening):
-            self.goals[arm] = Goal(goal.position, goal.orientation, action.value)
-        elif isinstance(action, Key):
-            if action.name in MOVES:
-                self.goals[arm] = goal.moved(step * MOVES[action.name][1], pose)
-            elif action.name in TURNS:
-                self.goals[arm] = goal.turned(TURN * TURNS[action.name][1])
-            elif action.name in POSES:
-                down = action.name == "X"
-                turned = DOWN if down else level_at(goal.position, arm)
-                self.goals[arm] = Goal(goal.position, turned.wxyz, goal.opening)
-            elif action.name == "space":
-                opening = 0.0 if goal.opening > 0.5 else 1.0
-                self.goals[arm] = Goal(goal.position, goal.orientation, opening)
-
-    def commands(self, view: SessionView, speed: float) -> dict[str, TeleopCommand]:
-        """Return the motions that lead to the goals at a largest speed in m/s."""
-        return {
-            arm: goal.command(view.arms[arm], speed, TURN_SPEED) for arm, goal in self.goals.items()
-        }
-
-
 class WebDevice:
     """The page; it is open when this has been made.
 
@@ -198,6 +100,7 @@ class WebDevice:
 
     Attributes:
         address: to open in a browser, token included.
+        hand: goals of the arms.
 
     Raises:
         RequestError: viser is not installed, or nothing can listen at the address.
@@ -216,7 +119,7 @@ class WebDevice:
     ) -> None:
         require_viser("teleop")
         self._closing = contextlib.ExitStack()
-        self._hand, self._arms = Hand(arms), tuple(arms)
+        self.hand, self._arms = Hand(arms), tuple(arms)
         self._actions: deque[Action] = deque()
         label = f"Teleoperation · {world.task.name}"
         self._server, self.address = self._closing.enter_context(
@@ -226,7 +129,6 @@ class WebDevice:
         if self._cameras:
             self._closing.callback(self._cameras.close)
         self._steps = 0
-        self._resets = (Mode.REVIEW, -1, -1)
         with self._server.atomic():
             self._make_scene(world)
             self._make_controls(has_policy, cameras)
@@ -234,21 +136,13 @@ class WebDevice:
 
     def update(self, view: SessionView) -> TeleopInput:
         """Show the session, and return what the person did since the last time."""
-        is_new = (view.mode, view.seed) != self._resets[:2] or view.step < self._resets[2]
-        self._resets = (view.mode, view.seed, view.step)
-        if (is_new and view.step == 0) or view.is_policy_acting or not self._hand.goals:
-            self._hand.follow(view)
-        events: list[TeleopEvent] = []
-        while self._actions:
-            action = self._actions.popleft()
-            if isinstance(action, TeleopEvent):
-                events.append(action)
-            elif not view.is_policy_acting and view.mode is not Mode.REVIEW:
-                self._hand.take(action, view, self._step.value / 1000.0)
+        actions = [self._actions.popleft() for _ in range(len(self._actions))]
+        step, speed = self._step.value / 1000.0, self._speed.value
+        asked = self.hand.update(view, actions, step, speed)
         if self._server.get_clients():
             self._show(view)
         self._steps += 1
-        return TeleopInput(self._hand.commands(view, self._speed.value), tuple(events))
+        return asked
 
     def close(self) -> None:
         """Close the page."""
@@ -263,10 +157,10 @@ class WebDevice:
         server.initial_camera.position = VIEW_FROM
         server.initial_camera.look_at = VIEW_AT
         self._scene = ViserScene(scene, world.model)
-        self._handles: dict[str, Any] = {}
+        self.handles: dict[str, Any] = {}
         for arm in self._arms:
             handle = scene.add_transform_controls(f"/goal/{arm}", HANDLE_SIZE, depth_test=False)
-            self._handles[arm] = handle
+            self.handles[arm] = handle
             handle.on_update(self._dragged(arm))
 
     def _dragged(self, arm: str) -> Callable[[Any], Any]:
@@ -345,8 +239,8 @@ class WebDevice:
         with self._server.atomic():
             if self._steps % SCENE_STEPS == 0:
                 self._scene.update(view.world.data)
-                for arm, goal in self._hand.goals.items():
-                    handle = self._handles[arm]
+                for arm, goal in self.hand.goals.items():
+                    handle = self.handles[arm]
                     if np.abs(handle.position - goal.position).max() > 1e-6:
                         handle.position = goal.position
                     if np.abs(handle.wxyz - goal.orientation).max() > 1e-6:
@@ -360,7 +254,7 @@ class WebDevice:
         text = status_html(view)
         if text != self._status_text:
             self._status.content = self._status_text = text
-        opening = round(self._hand.goals[view.active_arm].opening, 2)
+        opening = round(self.hand.goals[view.active_arm].opening, 2)
         if abs(self._opening.value - opening) > 0.005:
             self._opening.value = opening
         for event, button in self._buttons.items():
@@ -380,25 +274,11 @@ _OF_MODES = frozenset().union(*ALLOWED.values())
 
 def status_html(view: SessionView) -> str:
     """Return the state of a session as HTML."""
-    seconds = view.step * CONTROL_PERIOD
-    limit = view.step_limit * CONTROL_PERIOD
-    who = "the policy" if view.is_policy_acting else "you"
-    rate = "–" if math.isnan(view.rate) else f"{view.rate:.1f} Hz"
-    rows = {
-        "episodes": f"{view.saved} of {view.wanted} saved",
-        "seed": str(view.seed),
-        "time": f"{seconds:.1f} of {limit:.0f} s",
-        "task": "done" if view.is_success else "not done yet",
-        "arm": view.active_arm,
-        "gripper": " ".join(f"{value:.3f}" for value in view.arms[view.active_arm].position),
-        **({"acting": who} if view.has_policy else {}),
-        "loop": f"{rate}, {view.missed} late",
-    }
     cells = "".join(
         f"<span style='opacity:.65'>{name}</span>"
         f"<span style='font-variant-numeric:tabular-nums' data-rmb='{name}'>"
         f"{html.escape(value)}</span>"
-        for name, value in rows.items()
+        for name, value in status_rows(view).items()
     )
     grid = "display:grid;grid-template-columns:auto 1fr auto 1fr;gap:.1em .8em;margin:.5em 0"
     return (

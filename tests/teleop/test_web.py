@@ -27,15 +27,12 @@ from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.teleop.arms import SteeredArms
 from robo_manip_baselines.teleop.device import (
     ArmPose,
-    Mode,
     SessionView,
     TeleopCommand,
     TeleopEvent,
 )
 from robo_manip_baselines.teleop.goal import MAX_AHEAD, Goal
-from robo_manip_baselines.teleop.web import (
-    EVENTS,
-    HANDLE_SIZE,
+from robo_manip_baselines.teleop.hand import (
     MOVES,
     POSES,
     TURNS,
@@ -45,35 +42,11 @@ from robo_manip_baselines.teleop.web import (
     Hand,
     Key,
     Opening,
-    key_map,
-    status_html,
 )
+from robo_manip_baselines.teleop.web import EVENTS, HANDLE_SIZE, key_map, status_html
 
 ROOT = Path(__file__).resolve().parents[2]
 START = ArmPose(np.array([0.2, 0.5, 0.3]), np.array([0.0, 0.0, 0.0, 1.0]), 1.0)
-
-
-@pytest.fixture
-def view() -> SessionView:
-    nothing: Any = None
-    return SessionView(
-        mode=Mode.RECORDING,
-        seed=3,
-        step=50,
-        step_limit=600,
-        saved=1,
-        wanted=5,
-        steered=("left", "right"),
-        active_arm="right",
-        arms={"left": START, "right": START},
-        is_success=False,
-        has_policy=False,
-        is_policy_acting=False,
-        rate=49.96,
-        missed=2,
-        message="<recording>",
-        world=nothing,
-    )
 
 
 def arrive(goal: Goal, pose: ArmPose, steps: int, speed: float = 0.25) -> ArmPose:
