@@ -226,7 +226,7 @@ class EpisodePage:
         self._play = gui.add_checkbox("Play", initial_value=False)
         self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
         self._text = gui.add_markdown("")
-        self._joint = gui.add_dropdown("Joint", ("–",))
+        self._joint: viser.GuiDropdownHandle[str] = gui.add_dropdown("Joint", ["–"])
         self._panel = gui.add_panel()
         self._cameras = self._panel.add_tab("Cameras")
         self._panel.dock_left()

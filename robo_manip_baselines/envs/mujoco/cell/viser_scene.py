@@ -75,7 +75,7 @@ class ViserScene:
             scene.add_mesh_simple(
                 f"{root}/body_{body}/{'_'.join(map(str, colour))}",
                 *joined(parts),
-                color=colour[:3],
+                color=(colour[0], colour[1], colour[2]),
                 opacity=None if colour[3] == 255 else colour[3] / 255,
             )
         self._bones: list[tuple[int, Any]] = []
