@@ -278,8 +278,8 @@ def test_a_session_goes_where_mouse_and_keys_lead_and_stays_there(
 
 
 def refused(match: str, *options: str, out: Path) -> None:
+    given = ["--device", "spacemouse", *options, "--cameras", "none", "--out", str(out)]
     with pytest.raises(RequestError, match=match) as caught:
-        given = ["--device", "spacemouse", *options, "--cameras", "none", "--out", str(out)]
         teleop.main(["FeedingEnv", *given])
     assert "\n" not in str(caught.value)
     assert not out.exists()
