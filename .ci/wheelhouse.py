@@ -19,6 +19,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parent.parent
 # with an underscore, pip before 23.3 does not find the extra
 EXTRAS = "face-prediction,formats,ray,rl,train,dev"
+SOURCES = {"easyhid"}  # of Python alone, released without a wheel: one is built here
 SUPPORTED = ("3.10", "3.11", "3.12", "3.13")
 # The oldest and newest C library of the machines it is for: 2.28 is that of RHEL 8; Debian 10 and
 # Ubuntu 20.04 are newer still. A wheel may be tagged with any version up to it.
@@ -78,7 +79,10 @@ def main() -> None:
     target += [f"--abi={abi}" for abi in (tag, "abi3", "none")]
     target += [f"--platform={platform}" for platform in PLATFORMS]
     download = ["-m", "pip", "download", f"--dest={folder}", *target]
-    run(*download, "--no-deps", *pins(python, with_torch=False))
+    chosen = {pin: pin.partition("==")[0] in SOURCES for pin in pins(python, with_torch=False)}
+    run(*download, "--no-deps", *(pin for pin, is_source in chosen.items() if not is_source))
+    built_here = [pin for pin, is_source in chosen.items() if is_source]
+    run("-m", "pip", "wheel", f"--wheel-dir={folder}", "--no-deps", *built_here)
     if arguments.with_torch:  # what torch needs differs by its build, so here a resolver is asked
         torch = [pin for pin in pins(python, with_torch=True) if pin.startswith("torch==")]
         run(*download, f"--find-links={folder}", *torch)

@@ -12,7 +12,6 @@ import tyro
 from annotated_types import Interval
 
 from robo_manip_baselines.commands.rollout import face_arguments
-from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
@@ -85,8 +84,8 @@ class TeleopOptions:
     Attributes:
         env: Task, for example FeedingEnv.
         device: Device of the person: keyboard, in a window of MuJoCo; web, a page in the browser;
-            or replay, which plays recorded episodes back as if a person did it. If not given,
-            keyboard where there is a display, else web.
+            spacemouse, one or two of them beside either; or replay, which plays recorded episodes
+            back as if a person did it. If not given, keyboard where there is a display, else web.
         arm: Arms that the person steers: right, left or both; if not given, those of the task.
         out: Folder of the episodes; if not given, dataset/teleop/<env>.
         num_episodes: Episodes, one for each seed from --seed on that has none yet.
@@ -103,7 +102,7 @@ class TeleopOptions:
         images: Images of the episodes.
         replay: Only with --device replay.
         page: Only with --device web.
-        steering: Speed of the hand; only with --device keyboard.
+        steering: Speed of the hand; only with --device keyboard or spacemouse.
         shared: A policy that acts until the person takes over.
     """
 
@@ -131,18 +130,13 @@ class TeleopOptions:
         require_printable("--operator", self.operator)
 
 
-def default_device() -> str:
-    """Return ``keyboard`` where a window can be opened, else ``web``."""
-    return "web" if viewer_problem() else "keyboard"
-
-
 def to_config(options: TeleopOptions) -> TeleopConfig:
     """Return the configuration that the options ask for.
 
     Raises:
         RequestError: a value is not valid.
     """
-    from robo_manip_baselines.teleop.teleoperate import TeleopConfig
+    from robo_manip_baselines.teleop.teleoperate import TeleopConfig, default_device
 
     task, images = task_entry(options.env), options.images
     if options.replay.episodes and options.device != "replay":

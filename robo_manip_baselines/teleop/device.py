@@ -160,6 +160,7 @@ class TeleopDevice(Protocol):
 
 DEVICES: Mapping[str, str] = {
     "keyboard": "robo_manip_baselines.teleop.keyboard:KeyboardDevice",
+    "spacemouse": "robo_manip_baselines.teleop.spacemouse:SpaceMouseDevice",
     "web": "robo_manip_baselines.teleop.web:WebDevice",
     "replay": "robo_manip_baselines.teleop.replay:ReplayDevice",
 }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -91,9 +92,15 @@ class Hand:
         self.goals: dict[str, Goal] = {}
         self._shown = (Mode.REVIEW, -1, -1)
 
-    def follow(self, view: SessionView) -> None:
-        """Let the goals be where the grippers are commanded to be."""
-        self.goals = {arm: Goal.at(view.arms[arm]) for arm in self._arms}
+    def follow(self, view: SessionView, arms: Iterable[str] | None = None) -> None:
+        """Let the goals, or those of some arms, be where the grippers are commanded to be."""
+        chosen = self._arms if arms is None else arms
+        self.goals |= {arm: Goal.at(view.arms[arm]) for arm in chosen}
+
+    def toggle(self, arm: str) -> None:
+        """Close a gripper that is more than half open, or open it."""
+        goal = self.goals[arm]
+        self.goals[arm] = replace(goal, opening=0.0 if goal.opening > 0.5 else 1.0)
 
     def take(self, action: Action, view: SessionView, step: float) -> None:
         """Change a goal as the person asks.
@@ -120,8 +127,7 @@ class Hand:
                 turned = DOWN if down else level_at(goal.position, arm)
                 self.goals[arm] = Goal(goal.position, turned.wxyz, goal.opening)
             elif action.name == "space":
-                opening = 0.0 if goal.opening > 0.5 else 1.0
-                self.goals[arm] = Goal(goal.position, goal.orientation, opening)
+                self.toggle(arm)
 
     def update(
         self, view: SessionView, actions: Iterable[Action], step: float, speed: float

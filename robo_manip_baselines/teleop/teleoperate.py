@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import Interval
 
 from robo_manip_baselines.data import EpisodeReader, list_episodes
-from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, viewer_problem
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import (
@@ -64,7 +64,7 @@ class TeleopConfig:
         env_kwargs: further arguments of the environment.
         episodes: files, or folders of them, for the device ``replay``.
         page: address of the page of the device ``web``.
-        steering: speed of the hand with the device ``keyboard``.
+        steering: speed of the hand with the devices ``keyboard`` and ``spacemouse``.
         policy, checkpoint: policy that acts until the person takes over; None for none.
         policy_device: of its network.
 
@@ -183,6 +183,11 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
     return summary
 
 
+def default_device() -> str:
+    """Return ``keyboard`` where a window can be opened, else ``web``."""
+    return "web" if viewer_problem() else "keyboard"
+
+
 def open_device(config: TeleopConfig, kwargs: Mapping[str, Any], world: FaceEnv) -> TeleopDevice:
     """Open the device of a session.
 
@@ -200,9 +205,12 @@ def open_device(config: TeleopConfig, kwargs: Mapping[str, Any], world: FaceEnv)
             _require_same_world(path, config, kwargs)
         return make_device("replay", episodes=paths, arms=config.steered)
     given: dict[str, Any] = {"arms": config.steered}
+    if config.device == "spacemouse":
+        shown_by = replace(config, device=default_device())
+        given |= {"screen": lambda: open_device(shown_by, kwargs, world)}
     if config.device in ("keyboard", "web"):
         given |= {"world": world, "has_policy": config.policy is not None}
-    if config.device == "keyboard":
+    if config.device in ("keyboard", "spacemouse"):
         given["steering"] = config.steering
     if config.device == "web":
         given["cameras"] = config.cameras or (() if opengl_problem() else CAMERAS)

@@ -26,7 +26,7 @@ from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.expert.phases import DOWN
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.teleop import keyboard
+from robo_manip_baselines.teleop import keyboard, teleoperate
 from robo_manip_baselines.teleop.device import Mode, SessionView, TeleopEvent, TeleopInput
 from robo_manip_baselines.teleop.hand import MOVES, POSES, TURNS
 from robo_manip_baselines.teleop.keyboard import ARROWS, EVENTS, KEYS, TURN_KEY, KeyboardDevice
@@ -201,7 +201,7 @@ def test_the_device_is_the_keyboard_where_there_is_a_display(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for problem, name in ((None, "keyboard"), ("no display", "web")):
-        monkeypatch.setattr(teleop, "viewer_problem", lambda problem=problem: problem)
+        monkeypatch.setattr(teleoperate, "viewer_problem", lambda problem=problem: problem)
         assert teleop.to_config(teleop.TeleopOptions("FeedingEnv")).device == name
 
 
