@@ -40,7 +40,7 @@ def options(line: str) -> BenchmarkOptions:
     ("line", "words"),
     [
         ("feding", "did you mean 'feeding'"),
-        ("feeding --preset gpu", "cpu, paper, smoke"),
+        ("feeding --preset gpu", "cpu, cpu_images, paper, smoke"),
         ("feeding --executor slurm", "local, ray"),
         ("feeding --shard 3/2", "i from 1 to n"),
         ("feeding --shard 0/2", "i from 1 to n"),

@@ -402,7 +402,7 @@ class TestModelFile:
 
     def test_without_a_network_it_says_what_to_do(self, tmp_path: Path) -> None:
         nowhere = (tmp_path / "nothing").as_uri()
-        with pytest.raises(RequestError, match=r"fetch file:.*--model") as caught:
+        with pytest.raises(RequestError, match=r"fetch file:.*--detector_model") as caught:
             find_model(None, nowhere, "0")
         assert "\n" not in str(caught.value)
 

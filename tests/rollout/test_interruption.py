@@ -59,7 +59,10 @@ def test_workers_end_with_the_command(number: signal.Signals, tmp_path: Path) ->
     while any(status(worker)[:1] not in ([], ["Z"]) for worker in workers):
         assert time.monotonic() < end, "a worker lives on"
         time.sleep(0.05)
-    assert verify_dataset(tmp_path) == []
+    problems = verify_dataset(tmp_path)
+    if number == signal.SIGKILL:  # it may have hit a write, whose temporary file is then left
+        problems = [problem for problem in problems if not problem.is_warning]
+    assert problems == []
     if number != signal.SIGKILL:
         assert not list(tmp_path.rglob("*.partial"))
 

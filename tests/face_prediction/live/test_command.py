@@ -48,7 +48,7 @@ class DrawnFaces:
 def faces(monkeypatch, landmarks) -> DrawnFaces:
     drawn = DrawnFaces(landmarks)
     monkeypatch.setattr(live_command, "face_finder", lambda model: nullcontext(drawn.find))
-    monkeypatch.setattr(live_command, "find_model", lambda given, option: given)
+    monkeypatch.setattr(live_command, "find_model", lambda given: given)
     return drawn
 
 

@@ -69,9 +69,6 @@ class FaceScene:
     def watch_contacts(self) -> None:
         """Read the contacts of one physics step."""
 
-    def watch_face(self, physics_step: int) -> None:
-        """Look at the face after so many physics steps of the episode, if it is time for it."""
-
     # -- start -------------------------------------------------------------------------------------
 
     def lay_out(
@@ -160,6 +157,9 @@ class FaceScene:
         # After a step, sites and cameras are still where they were before its integration.
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
+
+    def watch_face(self, physics_step: int) -> None:
+        """Look at the face after so many physics steps of the episode, if it is time for it."""
 
     def _checked_action(self, action: Any) -> Floats:
         """Return an action as float64.
