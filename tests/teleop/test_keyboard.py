@@ -159,12 +159,12 @@ def test_an_episode_is_recorded_whatever_happens_in_the_window(
         session, store = make_session(feeding_env, device, steered=("right",), seeds=(3,))
         summary = session.run()
         assert summary.saved == 1
+        assert 55 <= len(store.episodes[0].arrays["time"]) <= 60
         assert windows[-1].is_closed
         heights.append(windows[-1].heights)
         windows.clear()
     assert heights[0] == heights[1]
     assert heights[0][-1] - heights[0][4] == pytest.approx(0.01, abs=0.002)
-    assert 55 <= len(store.episodes[0].arrays["time"]) <= 60
 
 
 def test_the_step_and_the_speed_are_options(
