@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import logging
 import math
-import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -19,6 +18,7 @@ import mujoco
 import numpy as np
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
+from robo_manip_baselines.envs.mujoco.cell.window import ViewerWindow
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.teleop.device import SessionView, TeleopEvent, TeleopInput
@@ -39,9 +39,6 @@ logger = logging.getLogger(__name__)
 
 STATUS_STEPS = 10
 """Control steps between two updates of the text: 5 a second."""
-
-PATIENCE = 10.0
-"""s to wait for the window to close; a window that is drawn without a GPU takes one or two."""
 
 ARROWS: Mapping[int, tuple[str, str, str]] = {
     263: ("left", "A", "J"),
@@ -114,8 +111,6 @@ class KeyboardDevice:
     ) -> None:
         if problem := viewer_problem():
             raise RequestError(f"--device keyboard: {problem}; --device web needs only a browser")
-        from mujoco import viewer  # opens a display's libraries
-
         self.hand = Hand(arms)
         self._steering = steering or SteeringOptions()
         self._pressed: deque[int] = deque()
@@ -124,15 +119,14 @@ class KeyboardDevice:
         self._model = copy.copy(world.model)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_copyData(self._data, self._model, world.data)
-        others = set(threading.enumerate())
-        self._viewer = viewer.launch_passive(
+        self._window = ViewerWindow(
             self._model,
             self._data,
             key_callback=self._pressed.append,
             show_left_ui=False,
             show_right_ui=False,
         )
-        self._threads = set(threading.enumerate()) - others
+        self._viewer = self._window.viewer
         with self._viewer.lock():
             _look(self._viewer.cam)
         keys = "\n".join(f"  {key:<17} {label}" for key, label in self._rows)
@@ -154,9 +148,7 @@ class KeyboardDevice:
 
     def close(self) -> None:
         """Close the window."""
-        self._viewer.close()
-        for thread in self._threads:  # a window that outlives the program ends it with an error
-            thread.join(PATIENCE)
+        self._window.close()
 
     def _actions(self) -> Iterator[Action]:
         """Empty the queue of the window's thread."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
 from robo_manip_baselines.envs.mujoco.cell.rendering import MAX_MULTISAMPLES, CameraRenderer
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
+from robo_manip_baselines.envs.mujoco.cell.window import ViewerWindow
 from robo_manip_baselines.envs.mujoco.face import FACES
 from robo_manip_baselines.envs.mujoco.face.camera_mouth import CameraMouth
 from robo_manip_baselines.envs.mujoco.face.forecasters import (
@@ -209,7 +210,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         if spec.sees_by_camera:
             has_depth = spec.mouth_source == "depth_camera"
             self._camera_mouth = CameraMouth(self.model, spec.camera_latency, has_depth=has_depth)
-        self._viewer: Any = None
+        self._window: ViewerWindow | None = None
         self._shown_at = 0.0
         self._stage = "made"
         low, high = self.model.actuator_ctrlrange[self._actuators].T.astype(np.float32)
@@ -327,13 +328,13 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         if self._camera_mouth:
             self._camera_mouth.close()
             self._camera_mouth = None
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
+        if self._window is not None:
+            self._window.close()
+            self._window = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: a viewer's window stays with the original."""
-        return {**self.__dict__, "_viewer": None}
+        return {**self.__dict__, "_window": None}
 
     def _require_open(self, method: str) -> None:
         if self._stage == "closed":
@@ -350,13 +351,11 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         """Show the present state in MuJoCo's viewer, in mode ``human``, no faster than in life."""
         if self.render_mode != "human":
             return
-        if self._viewer is None:
-            from mujoco import viewer  # opens a display's libraries
-
-            self._viewer = viewer.launch_passive(self.model, self.data)
-        if not self._viewer.is_running():  # the person has closed its window
+        if self._window is None:
+            self._window = ViewerWindow(self.model, self.data)
+        if not self._window.viewer.is_running():  # the person has closed it
             return
-        self._viewer.sync()
+        self._window.viewer.sync()
         # From one frame to the next, so that a slow step is not followed by hasty ones.
         time.sleep(max(0.0, self._shown_at + CONTROL_PERIOD - time.monotonic()))
         self._shown_at = time.monotonic()
