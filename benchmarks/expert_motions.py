@@ -80,7 +80,7 @@ class MotionCell:
 
     @property
     def key(self) -> tuple[str, str, str, str, int, int]:
-        """What identifies the cell."""
+        """Identity of the cell."""
         return self.env, self.expert, self.motion, self.face, self.seed, self.episodes
 
 

@@ -481,7 +481,7 @@ def draw_by_distance(rows: Sequence[Row], path: Path) -> None:
 
 
 def draw_pictures(path: Path, seed: int) -> None:
-    """What the detector finds as the gripper comes: frames of an episode with the landmarks."""
+    """Frames of an episode with the landmarks that the detector finds as the gripper comes."""
     import cv2
 
     from face_prediction.live.sources import face_finder

@@ -70,7 +70,7 @@ class ImageDifference:
 
 @dataclass(frozen=True)
 class EpisodeComparison:
-    """What differs between two episodes.
+    """Differences between two episodes.
 
     Attributes:
         lengths: control steps of each.
@@ -90,7 +90,7 @@ class EpisodeComparison:
 
     @property
     def is_same(self) -> bool:
-        """Whether nothing differs."""
+        """Return whether nothing differs."""
         found = (self.attributes, self.only_in, self.shapes, self.columns, self.images)
         return self.lengths[0] == self.lengths[1] and not any(found)
 

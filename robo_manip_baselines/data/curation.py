@@ -49,12 +49,12 @@ PARTS = ("train", "validation")
 """Folders that a split makes."""
 
 UNITS = ("episode", "person")
-"""What a split keeps together."""
+"""Units that a split keeps together."""
 
 
 @dataclass(frozen=True)
 class Copied:
-    """What a merge or a split has done.
+    """Result of a merge or a split.
 
     Attributes:
         demonstrations: number of episodes, by folder.
@@ -107,7 +107,7 @@ def merge_datasets(sources: Sequence[Path], out: Path) -> Copied:
 
 @dataclass(frozen=True)
 class SplitRequest:
-    """How a folder of episodes is split.
+    """Division of a folder of episodes.
 
     Attributes:
         fraction: share of the episodes to hold out, more than 0 and less than 1.

@@ -47,7 +47,7 @@ ARMS: dict[str, tuple[str, ...]] = {"right": ("right",), "both": ("left", "right
 """Arms that a policy moves and observes, in the order of state and action."""
 
 MOUTH_FRAMES = ("none", "gripper", "actions", "both")
-"""What is expressed relative to the mouth."""
+"""Parts that are expressed relative to the mouth."""
 
 MOUTH_TIMES = ("now", "forecast")
 """Mouth that it is relative to: the one observed, or the one forecast for when an action acts."""
@@ -55,7 +55,7 @@ MOUTH_TIMES = ("now", "forecast")
 MAX_IMAGE_SIZE = 4096
 
 MOUTH_SOURCES = ("truth", "camera", "depth_camera")
-"""Where the mouth in observations comes from: the simulator's truth, through the corruption, or a
+"""Sources of the mouth in observations: the simulator's truth, through the corruption, or a
 face detector that looks at images of ``front_close``, without or with their depth."""
 
 MEASURED = "measured"

@@ -141,7 +141,7 @@ class TeleopDevice(Protocol):
     """Device of a person. It is open when it has been made."""
 
     is_paced: bool
-    """Whether the session keeps real time, 50 control steps a second."""
+    """True if the session keeps real time, 50 control steps a second."""
 
     def update(self, view: SessionView) -> TeleopInput:
         """Show the session, and return what the person asks for now; called every period.

@@ -1,4 +1,4 @@
-"""What viser is given agrees with MuJoCo: surfaces, colours, poses, skins."""
+"""Agreement of viser's scene with MuJoCo: surfaces, colours, poses, skins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When what is shown was seen: delay, losses and rates, against tables and a slow detector."""
+"""Times at which the observed mouth was seen: delay, losses and rates, against tables."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ class Hid:
 
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Hid]:
-    """What is connected: two mice, not in the order of their numbers."""
+    """Connected devices: two mice, not in the order of their numbers."""
     connected = [Hid(tmp_path / "hidraw10"), Hid(tmp_path / "hidraw9")]
 
     class Enumeration:

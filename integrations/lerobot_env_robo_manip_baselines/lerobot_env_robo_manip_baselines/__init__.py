@@ -74,7 +74,7 @@ class RoboManipBaselinesConfig(EnvConfig):
 
     @property
     def spec(self) -> ObservationSpec:
-        """What is observed."""
+        """Observation spec."""
         return ObservationSpec(
             obs=self.obs,
             horizon=self.horizon,

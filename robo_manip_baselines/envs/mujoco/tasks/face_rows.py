@@ -1,4 +1,4 @@
-"""What every environment with a face records: rows of episode files, and safety of each step."""
+"""Recorded quantities of environments with a face: rows of episode files, safety of each step."""
 
 from __future__ import annotations
 

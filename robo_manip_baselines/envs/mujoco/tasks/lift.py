@@ -1,4 +1,4 @@
-"""What tasks share that begin with the lift of an object: its pose in episodes, and times."""
+"""Tasks that begin with the lift of an object: its pose in episodes, and times."""
 
 from __future__ import annotations
 
