@@ -1,6 +1,6 @@
 # Everything of the README in a container:
 #   docker build -t robo_manip_baselines .
-#   docker run --rm -it -v "$PWD/results:/work/results" robo_manip_baselines python bin/Rollout.py --help
+#   docker run --rm -it -v "$PWD/results:/app/results" robo_manip_baselines python bin/Rollout.py --help
 FROM python:3.12-slim-bookworm
 
 # Where PyTorch comes from: the small build without CUDA, or https://pypi.org/simple with it.
@@ -12,7 +12,7 @@ RUN apt-get update \
     && rm -rf /var/lib/apt/lists/*
 ENV MUJOCO_GL=egl
 
-WORKDIR /work
+WORKDIR /app
 COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
 COPY robo_manip_baselines robo_manip_baselines
 COPY face_prediction face_prediction
