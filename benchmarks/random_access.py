@@ -28,7 +28,8 @@ import tyro
 from numpy.typing import NDArray
 
 from robo_manip_baselines.data import EpisodeReader, list_episodes
-from robo_manip_baselines.data.formats.lerobot import EPISODES_PATH, LeRobotRequest, export_lerobot
+from robo_manip_baselines.data.formats.lerobot import LeRobotRequest, export_lerobot
+from robo_manip_baselines.data.formats.lerobot_dataset import EPISODES_PATH
 from robo_manip_baselines.data.formats.video import VideoEncoding, VideoReader
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError

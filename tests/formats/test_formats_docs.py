@@ -34,7 +34,7 @@ def test_variables_and_units_of_aloha(one_arm: Path) -> None:
 
 def test_features_of_lerobot() -> None:
     pytest.importorskip("pyarrow", reason="the format lerobot needs the extra formats")
-    from robo_manip_baselines.data.formats.lerobot import DEFAULT_FEATURES
+    from robo_manip_baselines.data.formats.lerobot_dataset import DEFAULT_FEATURES
 
     own = {"observation.state", "action", "next.reward", "next.success", "next.done"}
     assert (own | set(DEFAULT_FEATURES)) <= WORDS

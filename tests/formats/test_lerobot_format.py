@@ -20,10 +20,10 @@ import pyarrow.parquet
 from robo_manip_baselines.data import EpisodeReader, episode_path, list_episodes, write_episode
 from robo_manip_baselines.data.demonstrations import load_demonstrations
 from robo_manip_baselines.data.example import make_arrays, make_attributes
-from robo_manip_baselines.data.formats import lerobot
-from robo_manip_baselines.data.formats.lerobot import (
-    LeRobotRequest,
-    export_lerobot,
+from robo_manip_baselines.data.formats import lerobot, lerobot_dataset
+from robo_manip_baselines.data.formats.lerobot import LeRobotRequest, export_lerobot
+from robo_manip_baselines.data.formats.lerobot_dataset import (
+    histogram,
     image_statistics,
     sample_steps,
     shards,
@@ -215,7 +215,7 @@ def test_statistics_are_those_of_the_data(one_arm: Path, tmp_path: Path) -> None
 
 def test_large_images_are_thinned_out_before_they_are_measured() -> None:
     image = np.zeros((480, 640, 3), np.uint8)
-    counts = lerobot._histogram(image)
+    counts = histogram(image)
     assert counts[:, 0].tolist() == [120 * 160] * 3  # every fourth pixel, as 640 // 150 = 4
     found = image_statistics(counts, 1)
     assert found["max"] == [[[0.0]], [[0.0]], [[0.0]]]
@@ -233,7 +233,7 @@ def test_shards_hold_whole_episodes_in_order(one_arm: Path, tmp_path: Path) -> N
     assert shards([4, 4, 4], 8) == [0, 0, 1]
     assert shards([9, 1, 8], 8) == [0, 1, 2]
     root = tmp_path / "dataset"
-    plan = lerobot._Plan.of
+    plan = lerobot._plan
     with pytest.MonkeyPatch.context() as patch:  # shards of a byte: an episode in each
 
         def small(*args: Any) -> Any:
@@ -241,8 +241,8 @@ def test_shards_hold_whole_episodes_in_order(one_arm: Path, tmp_path: Path) -> N
             object.__setattr__(made, "limits", (1, 1))
             return made
 
-        patch.setattr(lerobot._Plan, "of", small)
-        patch.setattr(lerobot, "CHUNK_SIZE", 2)
+        patch.setattr(lerobot, "_plan", small)
+        patch.setattr(lerobot_dataset, "CHUNK_SIZE", 2)
         export_lerobot(one_arm, root, REQUEST)
     names = [f"chunk-{n // 2:03d}/file-{n % 2:03d}" for n in range(3)]
     found = sorted(p.relative_to(root / "data").as_posix() for p in root.glob("data/*/*"))
