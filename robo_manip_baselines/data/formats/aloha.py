@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.data.episode import EpisodeReader
-from robo_manip_baselines.data.files import list_episodes
+from robo_manip_baselines.data.formats.exported import export_episodes
 from robo_manip_baselines.data.formats.imported import (
     OWN_ATTRIBUTE,
     Frames,
@@ -32,7 +32,7 @@ from robo_manip_baselines.data.formats.imported import (
 )
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.runs.errors import RequestError, WriteError
-from robo_manip_baselines.runs.files import atomic_file, locked, remove_temporaries
+from robo_manip_baselines.runs.files import atomic_file
 from robo_manip_baselines.runs.hdf5 import (
     READ_ERRORS,
     attribute_of,
@@ -41,7 +41,6 @@ from robo_manip_baselines.runs.hdf5 import (
     open_hdf5,
     read_whole,
 )
-from robo_manip_baselines.runs.progress import ProgressBar
 
 GRIPPER_CLOSED, GRIPPER_OPEN = 0.01844, 0.05800
 """m, positions of a finger at which ALOHA's gripper is 0 and 1 (``constants.py`` of the public ACT
@@ -72,22 +71,13 @@ def export_aloha(folder: Path, out: Path) -> dict[str, str]:
         EpisodeFileError: an episode is damaged.
         WriteError: the disk is full, or fails.
     """
-    paths = list_episodes(folder)
-    require_sources(folder, paths, "episode_*.hdf5 file")
-    with locked(out, is_kept=False):
-        remove_temporaries(out)
-        new = 0
-        with ProgressBar(len(paths), "episode", "export") as bar:
-            for number, path in enumerate(paths):
-                target = out / f"episode_{number}.hdf5"
-                with EpisodeReader(path) as episode:
-                    if target.exists():
-                        _require_same(target, episode)
-                    else:
-                        _write(episode, target)
-                        new += 1
-                bar.advance()
-    return {"written to": str(out), "episodes": f"{len(paths)}, of which {new} new"}
+    return export_episodes(
+        folder,
+        out,
+        target=lambda number, path: f"episode_{number}.hdf5",
+        write=_write,
+        own=_own,
+    )
 
 
 def import_aloha(
@@ -165,20 +155,6 @@ def _write(episode: EpisodeReader, target: Path) -> None:
             )
             for step in range(steps):
                 images[step] = episode.frame(camera, step)
-
-
-def _require_same(target: Path, episode: EpisodeReader) -> None:
-    """Require that a file was made from an episode."""
-    try:
-        with open_hdf5(target) as file:
-            made_of = _own(file, target)
-    except READ_ERRORS as error:
-        raise RequestError(f"'{target}': {one_line(error)}; it is in the way") from error
-    wanted = episode.attributes["content_sha256"]
-    if not made_of or made_of.get("content_sha256") != wanted:
-        raise RequestError(
-            f"'{target}' was not exported from '{episode.path}'; choose another folder"
-        )
 
 
 def _own(file: h5py.File, path: Path) -> dict[str, Any] | None:

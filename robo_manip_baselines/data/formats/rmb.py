@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robo_manip_baselines.data.episode import EpisodeReader
-from robo_manip_baselines.data.files import list_episodes
+from robo_manip_baselines.data.formats.exported import export_episodes
 from robo_manip_baselines.data.formats.imported import (
     OWN_ATTRIBUTE,
     Frames,
@@ -32,7 +32,7 @@ from robo_manip_baselines.data.formats.imported import (
 )
 from robo_manip_baselines.data.formats.video import VideoEncoding, VideoReader, VideoWriter
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_folder, locked, remove_temporaries
+from robo_manip_baselines.runs.files import atomic_folder
 from robo_manip_baselines.runs.hdf5 import (
     READ_ERRORS,
     attribute_of,
@@ -41,7 +41,6 @@ from robo_manip_baselines.runs.hdf5 import (
     open_hdf5,
     read_whole,
 )
-from robo_manip_baselines.runs.progress import ProgressBar
 
 MAIN = "main.rmb.hdf5"
 IMAGE, VIDEO = "_rgb_image", "_rgb_image.rmb.mp4"
@@ -87,22 +86,14 @@ def export_rmb(folder: Path, out: Path, encoding: VideoEncoding = ENCODING) -> d
         EpisodeFileError: an episode is damaged.
         WriteError: the disk is full, or fails.
     """
-    paths = list_episodes(folder)
-    require_sources(folder, paths, "episode_*.hdf5 file")
-    with locked(out, is_kept=False):
-        remove_temporaries(out)
-        new = 0
-        with ProgressBar(len(paths), "episode", "export") as bar:
-            for path in paths:
-                with EpisodeReader(path) as episode:
-                    target = out / f"{path.stem}.rmb"
-                    if target.exists():
-                        _require_same(target, episode)
-                    else:
-                        _write(episode, target, encoding)
-                        new += 1
-                bar.advance()
-    return {"written to": str(out), "episodes": f"{len(paths)}, of which {new} new"}
+    return export_episodes(
+        folder,
+        out,
+        target=lambda number, path: f"{path.stem}.rmb",
+        write=lambda episode, target: _write(episode, target, encoding),
+        own=_own,
+        main=MAIN,
+    )
 
 
 def import_rmb(
@@ -123,20 +114,6 @@ def import_rmb(
 
 
 # -- writing ---------------------------------------------------------------------------------------
-
-
-def _require_same(target: Path, episode: EpisodeReader) -> None:
-    """Require that a ``.rmb`` folder was made from an episode."""
-    try:
-        with open_hdf5(target / MAIN) as file:
-            made_of = _own(file, target)
-    except READ_ERRORS as error:
-        raise RequestError(f"'{target}': {one_line(error)}; it is in the way") from error
-    wanted = episode.attributes["content_sha256"]
-    if not made_of or made_of.get("content_sha256") != wanted:
-        raise RequestError(
-            f"'{target}' was not exported from '{episode.path}'; choose another folder"
-        )
 
 
 def _write(episode: EpisodeReader, target: Path, encoding: VideoEncoding) -> None:
