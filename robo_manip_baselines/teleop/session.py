@@ -123,6 +123,7 @@ class TeleopSession:
         self._message, self._is_over = "", not self._seeds
         self._saved = self._successes = self._discarded = self._steps = self._missed = 0
         self._seconds = 0.0
+        self._resets = 0
 
     def run(self) -> SessionSummary:
         """Run until the person quits, or every seed has been saved or discarded."""
@@ -218,8 +219,6 @@ class TeleopSession:
         elif event is TeleopEvent.GIVE_BACK and self._policy and not self._is_policy_acting:
             self._policy.reset(self._seeds[0])
             self._is_policy_acting = True
-
-    _resets = 0
 
     def _begin(self, mode: Mode) -> None:
         """Put the world back to the start of the present seed."""
