@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.data.schema import TELEOP
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.rollout.demonstrate import Demonstration, EpisodeRecorder
@@ -249,7 +250,7 @@ class TeleopSession:
         )
         episode = self._recorder.finish(
             **self._facts,
-            source="teleop",
+            source=TELEOP,
             loop_rate=self._episode_rate,
             missed_deadlines=self._episode_missed,
             **optional,
