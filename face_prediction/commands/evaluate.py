@@ -144,7 +144,7 @@ def _evaluate(options: EvaluateOptions) -> int:
         )
         names, more = baseline_names(options, split.parts)
         notes += more
-        logger.info("fitting the baselines to what is not reported on")
+        logger.info("fitting the baselines")
         baselines = fit_baselines(dataset, (PERSISTENCE, *names), folds, split)
         if options.baselines_from is not None:
             wanted = FORECASTERS if "all" in options.baselines else options.baselines
@@ -182,7 +182,9 @@ def _evaluate(options: EvaluateOptions) -> int:
         tracks: list[TrackScores] = []
         if options.tracks and split.by == "person":
             stretches = [s for s in dataset_stretches(dataset, folds) if s.kind in found]
-            tracks = score_tracks(dataset.manifest, stretches, setup.predictors, options.progress)
+            # not those of the setup: its persistence copies images, of which a track has none
+            rows = [*baselines, *networks]
+            tracks = score_tracks(dataset.manifest, stretches, rows, options.progress)
             record["tracks"] = tracks_record(tracks, options.resamples, options.seed)
         write_evaluation_report(options.out, EvaluationReport(summaries, history, folds, record))
         logger.info("%s: tables.md, table1.csv, table2.csv, results.json", options.out)
@@ -202,18 +204,26 @@ def _evaluate(options: EvaluateOptions) -> int:
 
 
 def baseline_names(options: EvaluateOptions, folds: int) -> tuple[list[str], list[str]]:
-    """Baselines to fit to the people of other folds, and sentences on those that cannot be."""
-    if "all" not in options.baselines:
-        return list(options.baselines), []
-    if folds > 1:
-        return list(FORECASTERS), []
-    return list(UNFITTED), ["One fold: only baselines without parameters are fitted to it."]
+    """Baselines to fit to the people of other folds, and sentences on those that cannot be.
+
+    Of a dataset with one fold those named that have parameters are left to ``baselines_from``.
+    """
+    named = list(FORECASTERS) if "all" in options.baselines else list(options.baselines)
+    is_refused = "all" not in options.baselines and options.baselines_from is None
+    if folds > 1 or is_refused:
+        return named, []
+    return [name for name in named if name in UNFITTED], [
+        "One fold: only baselines without parameters are fitted to it."
+    ]
 
 
 def check_evaluate_options(options: EvaluateOptions) -> None:
     """Raise RequestError if an option is out of its range, before anything is read."""
     for kind in options.kinds:
         require_choice("kind of footage", kind, KINDS)
+    for name in options.baselines:
+        if name != "all":
+            require_choice("baseline", name, FORECASTERS)
     require_ranges(options, "--{} {}")
     model = options.detector_model
     if model is not None and not model.is_file():
