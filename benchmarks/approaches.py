@@ -55,6 +55,7 @@ PAPER_NAMES = {
     "cross_attention": PAPER_TABLE_1[2][0],
 }
 """Row of the tables -> that of the paper's Table I."""
+SPLITS: tuple[SplitName, ...] = ("sequence", "person")
 BASELINES = ("persistence", "ar_landmarks")
 
 CHANNELS = {32: (8, 16, 32), 64: (8, 16, 32, 64), 128: (8, 16, 32, 64, 64)}
@@ -94,7 +95,7 @@ class Options:
 
     dataset: Path = Path("face_dataset")
     approaches: tuple[str, ...] = tuple(APPROACHES)
-    splits: tuple[SplitName, ...] = ("sequence", "person")
+    splits: tuple[str, ...] = SPLITS
     seeds: tuple[Seed, ...] = (0, 1, 2)
     size: Count = 32
     steps: Count = 8000
@@ -113,6 +114,8 @@ class Options:
     def __post_init__(self) -> None:
         for approach in self.approaches:
             require_choice("approach", approach, APPROACHES)
+        for split in self.splits:
+            require_choice("split", split, SPLITS)
         for kind in self.kinds:
             require_choice("kind of footage", kind, KINDS)
         if self.size not in CHANNELS:
@@ -286,8 +289,7 @@ def page(options: Options) -> str:
         "are those that it prints, of its own recordings at 256 pixels; their variances cannot be "
         "variances in these units."
     ]
-    splits: tuple[SplitName, ...] = ("sequence", "person")
-    for split, kind in product(splits, options.kinds):
+    for split, kind in product(SPLITS, options.kinds):
         rows = read_rows(out, split, kind)
         if not rows:
             continue
@@ -449,7 +451,7 @@ def main() -> None:
         print((options.out / TIMES).read_text("utf-8"))
         return
     for seed in options.seeds:
-        for split in options.splits:
+        for split in (name for name in SPLITS if name in options.splits):
             for approach in options.approaches:
                 training = Training(approach, split, seed, *choose(options, approach, split))
                 evaluate(options, training, train(options, training))
