@@ -148,7 +148,7 @@ def _evaluate(options: EvaluateOptions) -> int:
         baselines = fit_baselines(dataset, (PERSISTENCE, *names), folds, split)
         if options.baselines_from is not None:
             wanted = FORECASTERS if "all" in options.baselines else options.baselines
-            baselines += baselines_from(options.baselines_from, wanted, folds)
+            baselines += baselines_from(options.baselines_from, wanted, folds, dataset)
         require_unseen(dataset, split, baselines)
         setup = prepare_evaluation(
             dataset,

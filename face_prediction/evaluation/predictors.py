@@ -340,7 +340,7 @@ def fit_baselines(
 
 
 def baselines_from(
-    source: Path, names: Iterable[str], folds: Sequence[int]
+    source: Path, names: Iterable[str], folds: Sequence[int], dataset: FaceDataset
 ) -> list[EvaluatedPredictor]:
     """Baselines with parameters, fitted to all people of another dataset, or shipped.
 
@@ -348,9 +348,10 @@ def baselines_from(
         source: folder made by build-dataset; ``shipped``; or a folder written by fit.
         names: of baselines; those without parameters are left out.
         folds: of the dataset that they are judged on.
+        dataset: that one.
 
     Raises:
-        RequestError: the source is neither.
+        RequestError: the source is neither, or holds somebody of the dataset.
     """
     from face_prediction.models.loading import load_baselines
 
@@ -363,6 +364,13 @@ def baselines_from(
     else:
         stored, subjects = load_baselines(source)
         forecasters = [forecaster for forecaster in stored if forecaster.name in wanted]
+    people = {clip.subject for clip in dataset.manifest.clips if clip.sequences}
+    if known := sorted(people & subjects):
+        some = ", ".join(known[:5] + ["..."] * (len(known) > 5))
+        raise RequestError(
+            f"--baselines_from {source}: is fitted to {len(known)} of the {len(people)} people of "
+            f"{dataset.folder} ({some}); give a dataset of others, or leave it out"
+        )
     result: list[EvaluatedPredictor] = []
     for forecaster in forecasters:
         fitted = FittedPredictor(BaselinePredictor(forecaster), subjects, source)
