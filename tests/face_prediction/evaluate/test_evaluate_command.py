@@ -44,6 +44,8 @@ def test_baselines_alone(dataset: Path, tmp_path: Path, capsys) -> None:
     assert "ssim" not in rows["constant_velocity"]["numbers"]
     assert record["kinds"]["natural"]["ssim_size"] == 64
     assert "| persistence | 0.0" in capsys.readouterr().out
+    # whole tracks have the copy of the last frame, too, which copies no image there
+    assert [row["name"] for row in record["tracks"]["natural"]["rows"]] == list(rows)
 
 
 def test_windows_of_people_who_were_trained_on(dataset: Path, tmp_path: Path, monkeypatch) -> None:
