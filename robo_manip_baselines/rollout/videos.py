@@ -191,10 +191,10 @@ def draw_track(
     fixed = np.round(np.where(valid[:, None], points, 0) * 16).astype(int)  # 1/16 pixel
     opacity = np.zeros(image.shape[:2], dtype=np.uint8)
     # From the past to the present: a brighter piece covers a fainter one, and none adds to another.
-    places = fixed.tolist()
+    places, is_valid, last = fixed.tolist(), valid.tolist(), len(points) - 1
     for index in range(1, len(points)):
-        if valid[index - 1] and valid[index]:
-            value = round(255 * (0.15 + 0.85 * index / (len(points) - 1)))
+        if is_valid[index - 1] and is_valid[index]:
+            value = round(255 * (0.15 + 0.85 * index / last))
             ends = places[index - 1], places[index]
             cv2.line(opacity, *ends, value, thickness, cv2.LINE_AA, shift=4)
     drawn = _paint(image, opacity, colour)
