@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.data.schema import TELEOP
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.rollout.demonstrate import Demonstration, EpisodeRecorder
@@ -123,6 +124,7 @@ class TeleopSession:
         self._message, self._is_over = "", not self._seeds
         self._saved = self._successes = self._discarded = self._steps = self._missed = 0
         self._seconds = 0.0
+        self._resets = 0
 
     def run(self) -> SessionSummary:
         """Run until the person quits, or every seed has been saved or discarded."""
@@ -219,8 +221,6 @@ class TeleopSession:
             self._policy.reset(self._seeds[0])
             self._is_policy_acting = True
 
-    _resets = 0
-
     def _begin(self, mode: Mode) -> None:
         """Put the world back to the start of the present seed."""
         self._mode, seed = mode, self._seeds[0]
@@ -250,7 +250,7 @@ class TeleopSession:
         )
         episode = self._recorder.finish(
             **self._facts,
-            source="teleop",
+            source=TELEOP,
             loop_rate=self._episode_rate,
             missed_deadlines=self._episode_missed,
             **optional,

@@ -12,6 +12,8 @@ from typing import Annotated, Any
 from annotated_types import Interval
 
 from robo_manip_baselines.data import EpisodeReader, list_episodes
+from robo_manip_baselines.data.files import UNRENDERED_FOLDER
+from robo_manip_baselines.data.schema import TELEOP
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, viewer_problem
 from robo_manip_baselines.envs.mujoco.face.motion import pin_library
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
@@ -151,13 +153,13 @@ def teleoperate(config: TeleopConfig) -> SessionSummary:
         wanted = {
             "env_id": config.task.env_id,
             "env_kwargs": kwargs,
-            "source": "teleop",
+            "source": TELEOP,
             "image_codec": config.codec,
             "image_quality": config.quality,
             "xml_hash": world.xml_hash,
         }
         refuse_other_settings(config.out, wanted)
-        refuse_other_settings(config.out / "unrendered", wanted)
+        refuse_other_settings(config.out / UNRENDERED_FOLDER, wanted)
         device = open_device(config, kwargs, world)
         with (
             contextlib.closing(device),

@@ -331,6 +331,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return None if isinstance(value, float) and math.isnan(value) else value
-
-
-# -- statistics ------------------------------------------------------------------------------------
