@@ -1,5 +1,9 @@
 """Speed of evaluation: control steps per second, by number of environments and of processes.
 
+Above each table stand, for one environment in this process, the speed of MuJoCo alone (the same
+physics steps, with nothing read between them: what no environment of this model can exceed) and
+that of ``env.step`` alone, without policy, metrics and shared memory.
+
 The policy holds the arm still and costs nothing, so the figures are those of the environments, of
 the shared memory and of the pipes; ``--checkpoint`` puts a trained policy in its place. Starting
 the processes is left out: every environment has done its first reset before the clock runs.
@@ -11,15 +15,18 @@ Example: python benchmarks/rollout_speed.py --num_envs 1 8 --workers 0 2
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem
+from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.observation.spec import ImageSize
@@ -49,6 +56,9 @@ class Options:
     cpu_time: bool = False
     """Count processor time; only with --workers 0."""
 
+
+TURN = 50
+"""Control steps for which the physics and ``env.step`` take turns."""
 
 ARM_STATE = 14
 """Numbers of an arm in an observation: 6 positions, 6 velocities, gripper, and its velocity."""
@@ -104,6 +114,30 @@ def measure(
         return sum(result.steps for result in results) / (clock() - begin)
 
 
+def alone(config: EnvConfig, steps: int, clock: Callable[[], float]) -> tuple[float, float]:
+    """Return control steps per second of the physics alone, and of ``env.step``.
+
+    The arms are held still. They take turns, so that other programs slow both down alike.
+    """
+    spent = np.zeros(2)
+    turns, length = max(1, steps // TURN), min(steps, TURN)
+    with contextlib.closing(config.make()) as env:
+        world = world_of(env)
+        env.reset(seed=0)
+        model, data = world.model, world.data
+        action = data.ctrl[[model.actuator(name).id for name in world.action_names]]
+        for _ in range(turns):
+            begin = clock()
+            for _ in range(length):
+                env.step(action)
+            middle = clock()
+            mujoco.mj_step(model, data, length * world.substeps)
+            spent += clock() - middle, middle - begin
+            env.reset(seed=0)
+    physics, step = turns * length / spent
+    return float(physics), float(step)
+
+
 def main() -> None:
     """Measure and print."""
     options = parse(Options, "python benchmarks/rollout_speed.py --num_envs 1 8 --workers 0 2")
@@ -120,7 +154,8 @@ def main() -> None:
 
             torch.set_num_threads(1)  # as Rollout.py does
     for name, config in configs(options, plan).items():
-        print(f"\n{name}: control steps/s")
+        physics, step = alone(config, options.steps, clock)
+        print(f"\n{name}: control steps/s; physics alone {physics:.0f}, env.step {step:.0f}")
         print("num_envs  " + "".join(f"{f'workers {w}':>12}" for w in options.workers))
         for num_envs in options.num_envs:
             cells = [

@@ -101,7 +101,8 @@ class FaceTouch:
 
     Attributes:
         touchers: `ROBOT_PARTS` and the objects.
-        pairs: the two geoms of every contact of the last physics step; -1 for a flexible one.
+        pairs: the two geoms of every contact of the last physics step; -1 for a flexible one. The
+            same list as of the step before where the same geoms touch.
         robot_force: N, the largest of one contact point between the face and the robot, or a tool
             that the outside of a face stops, in the last physics step.
     """
@@ -130,17 +131,21 @@ class FaceTouch:
     def clear(self) -> None:
         """Begin a control step."""
         self.pairs: list[list[int]] = []
+        self._packed_pairs, self._touching = b"", list[int]()
         self.robot_force = 0.0
         self._found: dict[tuple[str, str, bool], FaceContact] = {}
 
     def read(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Take in the contacts of a physics step."""
-        self.pairs = pairs = data.contact.geom.tolist()
+        geoms = data.contact.geom
+        # Which geoms touch changes seldom, and bytes are compared faster than they are unpacked.
+        if (packed := geoms.tobytes()) != self._packed_pairs:
+            self._packed_pairs, self.pairs, is_face = packed, geoms.tolist(), self._is_face
+            pairs = enumerate(self.pairs)
+            self._touching = [n for n, (a, b) in pairs if is_face[a] or is_face[b]]
         self.robot_force = 0.0
-        is_face = self._is_face
-        touching = [n for n, (a, b) in enumerate(pairs) if is_face[a] or is_face[b]]
-        if touching:
-            self._measure(model, data, touching)
+        if self._touching:
+            self._measure(model, data, self._touching)
 
     def _measure(self, model: mujoco.MjModel, data: mujoco.MjData, touching: list[int]) -> None:
         wrench = np.zeros(6)

@@ -1,7 +1,7 @@
 """Distances of the robot, and of what it carries, from the face and from its eyes.
 
-Cheap where nothing is near: spheres around the geoms are compared, and only what may be nearest
-is measured.
+Cheap where nothing is near: spheres around the geoms are compared with one around the whole face,
+then with those of its geoms, and only what may be nearest is measured.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ RANGE: Final = 0.06
 _OUTSIDE: Final = ("forehead", "eyes", "nose", "cheeks", "lips", "chin", "head")
 """Regions whose geoms are the surface of the face."""
 
-
-_NOWHERE: Final = -1
-"""Place in `Proximity` of the distance between the face and the links of an arm."""
+_ONES: Final = np.ones(3)
 
 
 class Proximity(NamedTuple):
@@ -75,7 +73,7 @@ class FaceProximity:
             kinds[geom] if is_object[geom] and body not in arms else ""
             for geom, body in zip(self._parts.tolist(), root, strict=True)
         ]
-        places = {ARM: _NOWHERE, GRIPPER: 0}
+        places = {ARM: None, GRIPPER: 0}
         self._place = [places.get(kinds[geom], 1) for geom in self._parts.tolist()]
         self._kinds = [*kinds, OTHER]
         surface = [
@@ -88,6 +86,11 @@ class FaceProximity:
         self._surface = len(surface)
         self._reach = model.geom_rbound[self._parts][:, None] + model.geom_rbound[self._face]
         self._limit = (self._reach + RANGE) ** 2
+        is_link = np.array([place is None for place in self._place])
+        self._limit[is_link, : self._surface] = 0.0  # links of an arm count for the eyes alone
+        self._head = model.body("face/head").id
+        around_face = _radius(model, self._head, self._face)
+        self._around = (model.geom_rbound[self._parts] + around_face + RANGE) ** 2
         sites = [f"{arm}/gripper" for arm in ("left", "right")] + ["mouth"]
         self._sites = np.array([model.site(site).id for site in sites])
 
@@ -95,10 +98,26 @@ class FaceProximity:
         self, model: mujoco.MjModel, data: mujoco.MjData, pairs: Sequence[Sequence[int]]
     ) -> Proximity:
         """Return the present distances, given the pairs of geoms that touch."""
-        places = data.geom_xpos
-        offset = places.take(self._parts, axis=0)[:, None] - places.take(self._face, axis=0)
-        square = np.einsum("ijk,ijk->ij", offset, offset)
+        places = data.geom_xpos.take(self._parts, axis=0)
         nearest = [RANGE] * 3  # in the order of `Proximity`
+        way = places - data.xpos[self._head]
+        if ((way * way) @ _ONES < self._around).any():
+            self._find_nearest(model, data, places, pairs, nearest)
+        hand, load, eye = (distance if distance < RANGE else None for distance in nearest)
+        sites = data.site_xpos.take(self._sites, axis=0)
+        return Proximity(hand, load, eye, sites[:2], sites[2])
+
+    def _find_nearest(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        places: NDArray[np.float64],
+        pairs: Sequence[Sequence[int]],
+        nearest: list[float],
+    ) -> None:
+        """Lower ``nearest``, hand, load and eye, to the distances of parts at ``places``."""
+        offset = places[:, None] - data.geom_xpos.take(self._face, axis=0)
+        square = np.einsum("ijk,ijk->ij", offset, offset)
         near = np.flatnonzero(square < self._limit)
         if len(near):
             # The nearest centres first; then spheres around the geoms rule most others out.
@@ -110,17 +129,27 @@ class FaceProximity:
                 part, other = divmod(pair, len(self._face))
                 place = 2 if other >= self._surface else self._place[part]
                 free = self._free[part]
-                if place == _NOWHERE or (free and free not in carried):
+                if place is None or (free and free not in carried):
                     continue
                 if least < (best := nearest[place]):
                     geoms = int(self._parts[part]), int(self._face[other])
                     distance = mujoco.mj_geomDistance(model, data, *geoms, best, None)
                     nearest[place] = min(best, max(distance, 0.0))
-        hand, load, eye = (distance if distance < RANGE else None for distance in nearest)
-        sites = data.site_xpos.take(self._sites, axis=0)
-        return Proximity(hand, load, eye, sites[:2], sites[2])
 
     def _carried(self, pairs: Sequence[Sequence[int]]) -> set[str]:
         """Return the kinds of things that touch a gripper."""
         kinds = ((self._kinds[first], self._kinds[second]) for first, second in pairs)
         return {kind for pair in kinds if GRIPPER in pair for kind in pair}
+
+
+def _radius(model: mujoco.MjModel, head: int, geoms: NDArray[np.intp]) -> float:
+    """Return m, of a sphere about a head that holds its geoms, however its jaw turns.
+
+    The origins of bodies, the jaw's hinge among them, keep their distance from that of the head.
+    """
+    bodies = model.geom_bodyid[geoms]
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    hinge = np.linalg.norm(data.xpos[bodies] - data.xpos[head], axis=1)
+    radius = hinge + np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
+    return float(radius.max()) + 1e-6  # for rounding, and welds that give way by less

@@ -367,10 +367,10 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         data = self.data
         return State(
             time=np.asarray(self.time),
-            joint_position=data.qpos[self._joint_qpos],
-            joint_velocity=data.qvel[self._joint_dof],
-            gripper_position=data.qpos[self._finger_qpos],
-            gripper_velocity=data.qvel[self._finger_dof],
+            joint_position=data.qpos.take(self._joint_qpos),
+            joint_velocity=data.qvel.take(self._joint_dof),
+            gripper_position=data.qpos.take(self._finger_qpos),
+            gripper_velocity=data.qvel.take(self._finger_dof),
             end_effector_position=self.gripper_position,
             target_position=self.target_track(),
             object_position=self.object_position(),

@@ -110,7 +110,9 @@ class FaceScene:
 
     def place_face(self) -> None:
         """Put the face where its motion starts, and derive the state of the scene."""
-        self._pose_face(0)
+        row = self._row() * self.substeps
+        self.data.mocap_pos[self._placed] = self._positions[row]
+        self.data.mocap_quat[self._placed] = self._orientations[row]
         if self._compliant_head is None:
             position, orientation = self.replay.bodies["face/mouth"]
             self.data.joint("face/cavity").qpos = (*position[0], *orientation[0])
@@ -142,21 +144,29 @@ class FaceScene:
             ValueError: the action has the wrong shape or is not finite.
         """
         action = self._checked_action(action)
-        low, high = self.model.actuator_ctrlrange[self._actuators].T
-        self.data.ctrl[self._actuators] = np.clip(action, low, high)
-        self.touch.clear()
-        for substep in range(self.substeps):
-            self._pose_face(substep + 1)
-            mujoco.mj_step(self.model, self.data)
-            self.touch.read(self.model, self.data)
+        low, high = self._action_range
+        self.data.ctrl[self._actuators] = np.minimum(np.maximum(action, low), high)
+        model, data, touch, head = self.model, self.data, self.touch, self._compliant_head
+        touch.clear()
+        placed, mocap_pos, mocap_quat = self._placed, data.mocap_pos, data.mocap_quat
+        physics_step = self.step_count * self.substeps
+        for row in self._physics_rows():
+            if head:
+                head.drive(data, row)
+                head.place_mouth(data)
+            mocap_pos[placed] = self._positions[row]
+            mocap_quat[placed] = self._orientations[row]
+            mujoco.mj_step(model, data)
+            touch.read(model, data)
             self.watch_contacts()
-            self.watch_face(self.step_count * self.substeps + substep + 1)
+            physics_step += 1
+            self.watch_face(physics_step)
         self.step_count += 1
-        if self._compliant_head:
-            self._compliant_head.place_mouth(self.data)
+        if head:
+            head.place_mouth(data)
         # After a step, sites and cameras are still where they were before its integration.
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_camlight(self.model, self.data)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
 
     def watch_face(self, physics_step: int) -> None:
         """Look at the face after so many physics steps of the episode, if it is time for it."""
@@ -167,7 +177,7 @@ class FaceScene:
         Raises:
             ValueError: it has the wrong shape, or is not finite.
         """
-        form = f"must be ({len(self._actuators)},) finite numbers"
+        form = self._action_form
         try:
             values = np.asarray(action)
         except (TypeError, ValueError):  # rows of different lengths, say
@@ -177,21 +187,19 @@ class FaceScene:
         values = values.astype(np.float64)
         if values.shape != self._actuators.shape:
             raise ValueError(f"action of shape {values.shape}: {form}")
-        if len(bad := np.flatnonzero(~np.isfinite(values))):
+        if not np.isfinite(values).all():
+            bad = np.flatnonzero(~np.isfinite(values))
             place = f"{values[bad[0]]} in element {bad[0]}, {self.action_names[bad[0]]}"
             raise ValueError(f"action with {place}: {form}")
         return values
 
-    def _pose_face(self, substep: int) -> None:
-        moving = 0 if self.motion_start is None else substep
-        last = (len(self.replay.jaw) - 1) * self.substeps
-        row = min(self._motion_step() * self.substeps + moving, last)
-        head = self._compliant_head
-        if head and substep:
-            head.drive(self.data, row)
-            head.place_mouth(self.data)
-        self.data.mocap_pos[self._placed] = self._positions[row]
-        self.data.mocap_quat[self._placed] = self._orientations[row]
+    def _physics_rows(self) -> list[int]:
+        """Rows of the replay's bodies at the ends of the physics steps of a control step."""
+        if self.motion_start is None:
+            return [0] * self.substeps
+        first = (self.step_count - self.motion_start) * self.substeps + 1
+        last = len(self._positions) - 1
+        return [min(row, last) for row in range(first, first + self.substeps)]
 
     def _motion_step(self) -> int:
         """Control steps since the motion started; 0 while it waits."""
@@ -323,6 +331,8 @@ class FaceScene:
         self._finger_qpos, self._finger_dof = model.jnt_qposadr[fingers], model.jnt_dofadr[fingers]
         servos = [f"{arm}/{joint}" for arm in arms for joint in (*ARM_JOINTS, "gripper")]
         self._actuators = np.array([model.actuator(servo).id for servo in servos])
+        self._action_range = np.ascontiguousarray(model.actuator_ctrlrange[self._actuators].T)
+        self._action_form = f"must be ({len(self._actuators)},) finite numbers"
         self._gripper_site = model.site("right/gripper").id
         self._mouth_site = model.site("mouth").id
         outside = (model.geom_contype & FACE) != 0

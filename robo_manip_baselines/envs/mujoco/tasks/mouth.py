@@ -34,7 +34,7 @@ def is_inside_mouth(offset: NDArray[np.float64], half_width: float, half_height:
         half_width: m, of the ellipse that the inner lips span.
         half_height: m, likewise.
     """
-    out, across, up = offset
+    out, across, up = offset.tolist()  # Python's floats are faster one by one
     if not -CAVITY_DEPTH <= out <= LIP_DEPTH:
         return False
     return bool((across / half_width) ** 2 + (up / half_height) ** 2 <= 1.0)

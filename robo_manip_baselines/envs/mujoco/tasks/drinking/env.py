@@ -306,14 +306,17 @@ class DrinkingEnv(FaceEnv):
 
     def watch_contacts(self) -> None:
         """Record which fingers touch the cup, and how hard the face is touched."""
-        for first, second in self.data.contact.geom.tolist():
-            if first in self._cup_geoms or second in self._cup_geoms:
-                self._fingers_on_cup |= self._finger_bits[first] | self._finger_bits[second]
-        self._face_force = max(self._face_force, self.max_face_force())
+        if (pairs := self.touch.pairs) is not self._watched_pairs:  # the same ones add nothing
+            self._watched_pairs, cup, bits = pairs, self._cup_geoms, self._finger_bits
+            for first, second in pairs:
+                if first in cup or second in cup:
+                    self._fingers_on_cup |= bits[first] | bits[second]
+        self._face_force = max(self._face_force, self.touch.robot_force)
 
     def _clear_contacts(self) -> None:
         self._fingers_on_cup = 0
         self._face_force = 0.0
+        self._watched_pairs: list[list[int]] | None = None
 
     def _pour(self) -> None:
         """Let liquid flow for one control period, at the pose that the cup has now."""

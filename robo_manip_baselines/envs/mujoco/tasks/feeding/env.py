@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
@@ -305,7 +306,7 @@ class FeedingEnv(FaceEnv):
         reward = float(now.is_success and not before.is_success)
         reward += float(now.is_success_strict and not before.is_success_strict)
         delivered = now.is_success and now.is_clear
-        return reward, delivered or bool(self.cube_position[2] < OFF_TABLE)
+        return reward, delivered or bool(self.data.xpos[self._cube_body, 2] < OFF_TABLE)
 
     def task_row(self) -> dict[str, Any]:
         """Return the present pose of the cube."""
@@ -333,16 +334,19 @@ class FeedingEnv(FaceEnv):
 
     def watch_contacts(self) -> None:
         """Record which fingers touch the cube, and how hard the robot touches the face."""
-        for first, second in self.touch.pairs:
-            if self._cube_geom in (first, second):
-                self._fingers_on_cube |= self._finger_bits[first] | self._finger_bits[second]
-        self._face_force = max(self._face_force, self.max_face_force())
+        if (pairs := self.touch.pairs) is not self._watched_pairs:  # the same ones add nothing
+            self._watched_pairs, cube, bits = pairs, self._cube_geom, self._finger_bits
+            for first, second in pairs:
+                if first == cube or second == cube:
+                    self._fingers_on_cube |= bits[first] | bits[second]
+        self._face_force = max(self._face_force, self.touch.robot_force)
         if self.meal:
             self.meal.hold(self.data)
 
     def _clear_contacts(self) -> None:
         self._fingers_on_cube = 0
         self._face_force = 0.0
+        self._watched_pairs: list[list[int]] | None = None
 
     def _fingers_on(self, arm: str) -> int:
         """Return how many fingers of an arm touched the cube in the last step."""
@@ -354,16 +358,18 @@ class FeedingEnv(FaceEnv):
 
     def _measure(self) -> StepMeasurements:
         mouth, utensil = self.mouth_position, self.utensil_position
+        way = utensil - mouth
         is_on_spoon = self.meal is not None and self.meal.is_on_spoon(self.data)
+        fingers = self._fingers_on("right")
         return StepMeasurements(
             time=self.time,
-            is_held=is_on_spoon if self.meal else self._fingers_on("right") == 2,
-            is_touched=is_on_spoon if self.meal else self._fingers_on("right") > 0,
-            cube_height=float(self.cube_position[2]),
+            is_held=is_on_spoon if self.meal else fingers == 2,
+            is_touched=is_on_spoon if self.meal else fingers > 0,
+            cube_height=float(self.data.xpos[self._cube_body, 2]),
             is_at_mouth=is_at_mouth(utensil, mouth),
             is_inside_mouth=self._is_inside_mouth(),
             touches_face=self._face_force > FACE_FORCE[self.utensil],
-            gripper_distance=float(np.linalg.norm(utensil - mouth)),
+            gripper_distance=math.sqrt(way.dot(way)),
         )
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, replace
+import operator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from robo_manip_baselines.envs.mujoco.tasks.lift import LiftProgress
 
 MOUTH_TOLERANCE = np.array([0.03, 0.01, 0.01])
 """m along world x (the face normal), y and z; the spatial condition of Algorithm 1, line 10."""
+
+_TOLERANCES = MOUTH_TOLERANCE.tolist()
 
 FACE_FORCE = {"gripper": 0.0, "spoon": 10.0}
 """N between robot and face beyond which strict success is lost: none for a gripper, which has
@@ -41,7 +44,8 @@ def is_at_mouth(gripper: NDArray[np.float64], mouth: NDArray[np.float64]) -> boo
     The first one is the gripper, or the middle of a spoon's bowl. They are within 0.03, 0.01 and
     0.01 m of one another, the bounds excluded.
     """
-    return bool(np.all(np.abs(gripper - mouth) < MOUTH_TOLERANCE))
+    distances = np.abs(gripper - mouth).tolist()  # Python's floats are faster one by one
+    return all(map(operator.lt, distances, _TOLERANCES))
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,7 @@ class FeedingProgress(LiftProgress):
             phase = Phase.CARRY if success_time is None else Phase.DELIVER
         else:
             phase = Phase.GRASP if step.is_held else Phase.REACH
-        return replace(
-            self,
+        return FeedingProgress(
             phase=phase,
             lift_time=lift_time,
             success_time=success_time,

@@ -162,7 +162,7 @@ class FaceWipingEnv(FaceEnv):
 
     def watch_contacts(self) -> None:
         """Add up force and place of the contacts of the pad, and see to the eyes."""
-        for number, pair in enumerate(self.data.contact.geom.tolist()):
+        for number, pair in enumerate(self.touch.pairs):
             if self._face_geoms.isdisjoint(pair):
                 continue
             mujoco.mj_contactForce(self.model, self.data, number, self._wrench)
