@@ -78,8 +78,8 @@ class Options:
         splits: sequence, the paper's; person.
         seeds: Seeds of the trainings, each also the part or fold that it leaves for the report.
         size: Side of the images.
-        settings: Settings of all networks, as NAME=VALUE, such as landmark_weight=468 (equation 4 to
-            the letter; not of image_only); give such trainings another --out.
+        settings: Settings of all networks, as NAME=VALUE: landmark_weight=468 is equation 4 to the
+            letter (not of image_only). Give such trainings another --out.
         steps: Optimiser steps of each training; a larger number extends trainings.
         batch_size: Sequences of a step.
         learning_rates: Learning rates. Of several, the one that does best on the validation part of
@@ -288,9 +288,10 @@ def page(options: Options) -> str:
     """All tables of everything that a folder holds."""
     out = options.out
     parts = [
+        "# The paper's approaches",
         "Mean over the training seeds, in brackets the least and the greatest. The paper's figures "
         "are those that it prints, of its own recordings at 256 pixels; their variances cannot be "
-        "variances in these units."
+        "variances in these units.",
     ]
     for split, kind in product(SPLITS, options.kinds):
         rows = read_rows(out, split, kind)
