@@ -15,6 +15,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import KINDS
+from face_prediction.dataset.split import SplitName, split_dataset
 from face_prediction.dataset.tracks import dataset_stretches
 from face_prediction.evaluation.figures import draw_gains, write_figures
 from face_prediction.evaluation.predictors import (
@@ -24,7 +25,6 @@ from face_prediction.evaluation.predictors import (
     group_networks,
     load_network,
     require_strangers,
-    used_folds,
 )
 from face_prediction.evaluation.scoring import score_forecasts, score_shuffled_images
 from face_prediction.evaluation.setup import (
@@ -79,7 +79,9 @@ class EvaluateOptions:
             one fold, only those without parameters can be.
         baselines_from: a dataset that baselines are fitted to as well, as rows of their own; or
             shipped: those that come with the shipped weights.
-        tracks: also forecast whole tracks, from every frame, up to 24 frames ahead.
+        split: person: nobody is forecast by what was trained on them. sequence: the paper's,
+            windows that were not trained on, of people who were.
+        tracks: also forecast whole tracks, from every frame, up to 24 frames ahead; by person only.
         kinds: kinds of footage to report on, each by itself.
         out: folder for tables and figures.
         detector_model: MediaPipe's face_landmarker.task, for networks that forecast images only.
@@ -98,6 +100,7 @@ class EvaluateOptions:
     checkpoints: tuple[Path, ...] = ()
     baselines: tuple[str, ...] = ("all",)
     baselines_from: Path | None = None
+    split: SplitName = "person"
     tracks: bool = True
     kinds: tuple[str, ...] = KINDS
     out: Path = Path("results/faces")
@@ -126,27 +129,27 @@ def _evaluate(options: EvaluateOptions) -> int:
         dataset = stack.enter_context(FaceDataset(options.dataset))
         stack.enter_context(logging_redirect_tqdm())
         dataset_sha256 = file_digest(options.dataset / MANIFEST_NAME)
-        loaded = [load_network(folder, dataset_sha256) for folder in options.checkpoints]
-        all_folds = dataset.manifest.folds
-        networks = group_networks(loaded, used_folds(dataset))
+        split = split_dataset(dataset, options.split)
+        loaded = [load_network(folder, dataset_sha256, split) for folder in options.checkpoints]
+        networks = group_networks(loaded, split.used)
         notes = [
             require_strangers(dataset, fitted)
             for fitted in loaded
             if (fitted.checkpoint or {})["test_fold"] is None
         ]
-        require_unseen(dataset, networks)
-        folds = common_folds(networks) if networks else tuple(range(all_folds))
+        require_unseen(dataset, split, networks)
+        folds = common_folds(networks) if networks else tuple(split.used)
         selection = select_sequences(
-            dataset, folds, options.kinds, options.max_sequences, options.seed
+            dataset, folds, options.kinds, options.max_sequences, options.seed, split
         )
-        names, more = baseline_names(options, all_folds)
+        names, more = baseline_names(options, split.parts)
         notes += more
-        logger.info("fitting the baselines to the people of other folds")
-        baselines = fit_baselines(dataset, (PERSISTENCE, *names), folds)
+        logger.info("fitting the baselines")
+        baselines = fit_baselines(dataset, (PERSISTENCE, *names), folds, split)
         if options.baselines_from is not None:
             wanted = FORECASTERS if "all" in options.baselines else options.baselines
-            baselines += baselines_from(options.baselines_from, wanted, folds)
-        require_unseen(dataset, baselines)
+            baselines += baselines_from(options.baselines_from, wanted, folds, dataset)
+        require_unseen(dataset, split, baselines)
         setup = prepare_evaluation(
             dataset,
             selection,
@@ -172,14 +175,16 @@ def _evaluate(options: EvaluateOptions) -> int:
             "resamples": options.resamples,
             "shuffle_pictures": options.shuffle_images,
         }
-        record = provenance(dataset, dataset_sha256, loaded, option_record)
-        left_out = notes_on_selection(networks, folds, all_folds, options.max_sequences)
+        record = provenance(dataset, dataset_sha256, split, loaded, option_record)
+        left_out = notes_on_selection(networks, folds, split, options.max_sequences)
         record["notes"] = [*notes, *left_out]
         history = dataset.manifest.settings.history
         tracks: list[TrackScores] = []
-        if options.tracks:
+        if options.tracks and split.by == "person":
             stretches = [s for s in dataset_stretches(dataset, folds) if s.kind in found]
-            tracks = score_tracks(dataset.manifest, stretches, setup.predictors, options.progress)
+            # not those of the setup: its persistence copies images, of which a track has none
+            rows = [*baselines, *networks]
+            tracks = score_tracks(dataset.manifest, stretches, rows, options.progress)
             record["tracks"] = tracks_record(tracks, options.resamples, options.seed)
         write_evaluation_report(options.out, EvaluationReport(summaries, history, folds, record))
         logger.info("%s: tables.md, table1.csv, table2.csv, results.json", options.out)
@@ -199,18 +204,26 @@ def _evaluate(options: EvaluateOptions) -> int:
 
 
 def baseline_names(options: EvaluateOptions, folds: int) -> tuple[list[str], list[str]]:
-    """Baselines to fit to the people of other folds, and sentences on those that cannot be."""
-    if "all" not in options.baselines:
-        return list(options.baselines), []
-    if folds > 1:
-        return list(FORECASTERS), []
-    return list(UNFITTED), ["One fold: only baselines without parameters are fitted to it."]
+    """Baselines to fit to the people of other folds, and sentences on those that cannot be.
+
+    Of a dataset with one fold those named that have parameters are left to ``baselines_from``.
+    """
+    named = list(FORECASTERS) if "all" in options.baselines else list(options.baselines)
+    is_refused = "all" not in options.baselines and options.baselines_from is None
+    if folds > 1 or is_refused:
+        return named, []
+    return [name for name in named if name in UNFITTED], [
+        "One fold: only baselines without parameters are fitted to it."
+    ]
 
 
 def check_evaluate_options(options: EvaluateOptions) -> None:
     """Raise RequestError if an option is out of its range, before anything is read."""
     for kind in options.kinds:
         require_choice("kind of footage", kind, KINDS)
+    for name in options.baselines:
+        if name != "all":
+            require_choice("baseline", name, FORECASTERS)
     require_ranges(options, "--{} {}")
     model = options.detector_model
     if model is not None and not model.is_file():

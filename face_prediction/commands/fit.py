@@ -12,7 +12,8 @@ from pathlib import Path
 
 from face_prediction.dataset.manifest import MANIFEST_NAME, ClipEntry
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.dataset.tracks import FaceStretch, dataset_stretches
+from face_prediction.dataset.split import NO_PART_LEFT, SplitName, split_dataset
+from face_prediction.dataset.tracks import FaceStretch, dataset_stretches, without_windows
 from face_prediction.evaluation.predictors import UNFITTED, dataset_landmarks
 from face_prediction.forecast import FORECASTERS, fit_forecaster
 from face_prediction.models.loading import RESIDUAL, save_residual
@@ -45,14 +46,17 @@ class FitOptions:
 
     Attributes:
         dataset: Folder made by build-dataset.
-        test_fold: Fold whose people are left for the report. None: nobody is, for weights that are
-            shipped.
+        test_fold: Fold whose people are left for the report, or part of a split by sequence. None:
+            nobody is, for weights that are shipped.
+        split: person: parts are the dataset's folds. sequence: ten parts of windows that do not
+            overlap, drawn from the same people, as the paper's.
         ship_only: Fit only to clips whose row says ship=yes.
-        out: Folder for the weights; None: checkpoints/residual_foldK.
+        out: Folder for the weights; None: checkpoints/residual_foldK, or residual_sequenceK.
     """
 
     dataset: Path = Path("face_dataset")
     test_fold: NonNegativeInt | None = 0
+    split: SplitName = "person"
     ship_only: bool = False
     out: Path | None = None
 
@@ -63,7 +67,7 @@ def run_fit(options: FitOptions) -> int:
     Raises:
         RequestError: the dataset cannot be used, or holds too few people.
     """
-    name = f"residual_fold{options.test_fold}"
+    name = f"residual_{'fold' if options.split == 'person' else 'sequence'}{options.test_fold}"
     out = options.out or Path("checkpoints") / name
     require_out_folder(out, WEIGHTS, [options.dataset])
     with locked(out, is_kept=False), FaceDataset(options.dataset) as dataset:
@@ -75,24 +79,30 @@ def _fit(dataset: FaceDataset, options: FitOptions, out: Path) -> int:
     from face_prediction.models.residual.fit import HORIZONS, fit_residual
 
     manifest = dataset.manifest
-    if options.test_fold is not None and options.test_fold >= manifest.folds:
-        valid = f"valid: 0 to {manifest.folds - 1}, None"
+    split = split_dataset(dataset, options.split)
+    if options.test_fold is None and split.by == "sequence":
+        raise RequestError(f"--split sequence --test_fold None: {NO_PART_LEFT}")
+    if options.test_fold is not None and options.test_fold >= split.parts:
+        valid = f"valid: 0 to {split.parts - 1}, None"
         raise RequestError(f"--test_fold {options.test_fold}: no such fold; {valid}")
-    folds = {*range(manifest.folds)} - {options.test_fold}
+    tested = [] if options.test_fold is None else [options.test_fold]
+    folds = {*range(split.parts)} - {*tested}
+    rows = split.training(tested)
     used = [
         clip
         for clip in manifest.clips
-        if clip.fold in folds and (clip.ship or not options.ship_only)
+        if (split.by == "sequence" or clip.fold in folds) and (clip.ship or not options.ship_only)
     ]
     names = {clip.clip for clip in used}
-    stretches = [s for s in dataset_stretches(dataset, folds) if s.clip in names]
-    chosen = most_of_each(stretches)
+    stretches = without_windows(dataset_stretches(dataset), split.windows(tested))
+    long = [s for s in stretches if s.clip in names and len(s) >= manifest.settings.length]
+    chosen = most_of_each(long)
     subjects = sorted({stretch.subject for stretch in chosen})
     logger.info("fitting to %d tracks of %d people", len(chosen), len(subjects))
     fit = fit_residual([s.landmarks for s in chosen], [s.subject for s in chosen])
-    sequences = dataset_landmarks(dataset, folds, names)
+    is_used = [manifest.clips[place].clip in names for place in split.clip[rows].tolist()]
+    sequences = dataset_landmarks(dataset, rows[is_used])
     baselines = [fit_forecaster(kind, sequences) for kind in FORECASTERS if kind not in UNFITTED]
-    tested = [] if options.test_fold is None else [options.test_fold]
     record = CheckpointRecord(
         model=RESIDUAL,
         settings={"experts": [repr(expert) for expert in EXPERTS], "horizons": list(HORIZONS)},
@@ -106,6 +116,8 @@ def _fit(dataset: FaceDataset, options: FitOptions, out: Path) -> int:
         step=0,
         validation={},
         versions=software_versions(),
+        split=split.by,
+        windows_sha256=split.windows_sha256,
     )
     save_residual(out, record, fit, baselines)
     write_text(out / "attribution.csv", attribution_csv(used, set(record.train_subjects)))

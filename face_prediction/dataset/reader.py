@@ -26,9 +26,7 @@ from face_prediction.dataset.clip_file import (
 from face_prediction.dataset.manifest import (
     CLIP_FOLDER,
     ClipEntry,
-    FoldSplit,
     SequenceRow,
-    fold_split,
     read_manifest,
 )
 from face_prediction.dataset.sequences import STATISTICS, SequenceSettings
@@ -119,9 +117,11 @@ class FaceDataset:
         ]
         return np.flatnonzero(np.repeat(keep, [clip.sequences for clip in clips]))
 
-    def split(self, test: int) -> FoldSplit:
-        """The split that reports on fold ``test``; see `fold_split`."""
-        return fold_split(self.manifest.folds, test)
+    def starts(self) -> np.ndarray:
+        """(N,) int: the first frame of every sequence, in its clip at the dataset's rate."""
+        clips = enumerate(self.manifest.clips)
+        found = [self._open(place).start for place, clip in clips if clip.sequences]
+        return np.concatenate([np.empty(0, dtype=np.int64), *found]).astype(np.int64)
 
     def landmarks(self, index: int) -> np.ndarray:
         """(F, 468, 3) float32 in the coordinates of the images, without reading these."""

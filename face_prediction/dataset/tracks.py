@@ -9,8 +9,8 @@ Legend: T frames of a track, L = 468 landmarks.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,23 @@ class FaceStretch:
             seen = slice(max(0, frame - settings.history + 1), frame + 1)
             sides[frame] = (high[seen].max(axis=0) - low[seen].min(axis=0)).max()
         return sides * (1 + 2 * settings.margin)
+
+
+def without_windows(
+    stretches: Iterable[FaceStretch], windows: Mapping[str, Iterable[tuple[int, int]]]
+) -> list[FaceStretch]:
+    """What is left of stretches without the frames of ``windows`` (first frame, end), by clip."""
+    found: list[FaceStretch] = []
+    for stretch in stretches:
+        stop = stretch.start + len(stretch)
+        begin = stretch.start
+        for first, end in [*sorted(windows.get(stretch.clip, ())), (stop, stop)]:
+            until = min(first, stop)
+            if until > begin:
+                frames = slice(begin - stretch.start, until - stretch.start)
+                found.append(replace(stretch, start=begin, landmarks=stretch.landmarks[frames]))
+            begin = max(begin, end)
+    return found
 
 
 def pixel_landmarks(landmarks: NDArray[np.floating], image_size: Size) -> NDArray[np.float32]:

@@ -108,17 +108,24 @@ def draw_calibration(path: Path, summaries: Sequence[KindSummary]) -> None:
     _save_png(figure, path)
 
 
+MOST_NAMES = 12
+"""People whose names are written beside their dots; more would overlap."""
+
+
 def draw_gains(path: Path, all_scores: Sequence[TrackScores]) -> None:
     """Error of the first network against the best baseline's, by the smoothness of the motion.
 
-    A dot is a person, the larger the more frames there are of them; frames 3-5 of whole tracks.
-    Without a network that forecasts whole tracks there is no figure.
+    A dot is a person, the larger the more frames there are of them; frames 3-5 of whole tracks. Up
+    to `MOST_NAMES` people are named. Without a network that forecasts whole tracks there is no
+    figure.
     """
     networks = [[i for i, (_, role) in enumerate(s.rows) if role == "network"] for s in all_scores]
     if not any(networks):
         return
-    figure = new_matplotlib_figure(6.4, 4.0)
+    figure = new_matplotlib_figure(6.4, 4.8)
     axes = figure.subplots()
+    names: set[str] = set()
+    is_named = sum(len(scores.subjects) for scores in all_scores) <= MOST_NAMES
     for scores, rows, colour in zip(all_scores, networks, COLOURS, strict=False):
         if not rows:
             continue
@@ -127,13 +134,21 @@ def draw_gains(path: Path, all_scores: Sequence[TrackScores]) -> None:
         seen = scores.counts[:, FAR] > 0
         size = 6 + 4 * np.sqrt(scores.frames[seen] / 30)
         label = f"{scores.kind}, against {scores.rows[scores.best][0]}"
+        names.add(scores.rows[rows[0]][0])
         axes.scatter(
             scores.smoothness[seen], gain[seen], size, color=colour, alpha=0.7, label=label
         )
+        for place in np.flatnonzero(seen) if is_named else ():
+            point = (scores.smoothness[place], gain[place])
+            away = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 8}
+            axes.annotate(scores.subjects[place], point, **away)
     axes.axhline(0, color="black", lw=0.8)
+    axes.margins(x=0.12)
+    axes.grid(alpha=0.3)
+    axes.set_title(f"{', '.join(sorted(names))}: each person, frames 3–5 ahead of whole tracks")
     axes.set_xlabel("smoothness: correlation of a step of the mouth with the next")
-    axes.set_ylabel("error against the best baseline, %")
-    axes.legend(frameon=False)
+    axes.set_ylabel("error against the best baseline, %\n(below 0: better)")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16))
     _save_png(figure, path)
 
 

@@ -5,10 +5,10 @@ Legend: B histories, T frames of history, H horizon, L = 468 landmarks, S side o
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,16 @@ from numpy.typing import NDArray
 from face_prediction.dataset.image_batches import SequenceBatch
 from face_prediction.dataset.manifest import MANIFEST_NAME, SequenceRow
 from face_prediction.dataset.reader import FaceDataset
+from face_prediction.dataset.split import DatasetSplit, split_dataset
 from face_prediction.forecast import FORECASTERS, Forecaster, LandmarkSequences, fit_forecaster
 from face_prediction.prediction.interface import Forecast, ImageNeeds, Predictor
 from face_prediction.tracking.detector import FaceDetector
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import file_digest
+
+if TYPE_CHECKING:
+    from face_prediction.models.learned import CheckpointRecord
 
 Role = Literal["baseline", "network", "reference"]
 """baseline: fitted here. network: trained before. reference: no forecast, but what one is compared
@@ -84,7 +88,9 @@ def find_landmarks(images: NDArray[np.uint8], detector: FaceDetector) -> NDArray
 
 @dataclass(frozen=True)
 class FittedPredictor:
-    """A predictor, and the ``subjects`` whose footage shaped it.
+    """A predictor, and the ``subjects`` whose footage shaped it and whom it must not meet.
+
+    There are none where windows are kept apart, and not people.
 
     Attributes:
         folder: of a trained network.
@@ -178,11 +184,11 @@ def cross_fit(
             "give either --checkpoints (shipped, or one folder for each fold) or --baseline "
             f"({', '.join(FORECASTERS)})"
         )
-    folds = used_folds(dataset)
+    split = split_dataset(dataset)
     if baseline is not None:
-        return fit_baselines(dataset, [baseline], folds)[0]
+        return fit_baselines(dataset, [baseline], split.used, split)[0]
     digest = file_digest(dataset.folder / MANIFEST_NAME)
-    loaded = [load_network(folder, digest) for folder in checkpoints]
+    loaded = [load_network(folder, digest, split) for folder in checkpoints]
     name = loaded[0].predictor.name
     for other in loaded:
         if other.predictor.name != name:
@@ -190,23 +196,18 @@ def cross_fit(
                 f"{other.folder}: is '{other.predictor.name}', {checkpoints[0]} is '{name}'; give "
                 "checkpoints of one kind"
             )
-    return _one_for_each_fold(name, loaded, folds)
+    return _one_for_each_fold(name, loaded, split.used)
 
 
-def used_folds(dataset: FaceDataset) -> list[int]:
-    """Folds with sequences."""
-    clips = dataset.manifest.clips
-    return sorted({clip.fold for clip in clips if clip.sequences and clip.fold is not None})
-
-
-def load_network(folder: Path, dataset_sha256: str) -> FittedPredictor:
+def load_network(folder: Path, dataset_sha256: str, split: DatasetSplit) -> FittedPredictor:
     """The weights in ``folder``, or those shipped.
 
-    Those trained with the dataset whose ``dataset.json`` has that hash are for its test fold.
-    Others are for everybody, as long as they know nobody: their ``test_fold`` is None.
+    Those trained with the dataset whose ``dataset.json`` has that hash are for its test fold, or
+    for the test part of a split by sequence. Others are for everybody, as long as they know nobody:
+    their ``test_fold`` is None.
 
     Raises:
-        RequestError: there are none.
+        RequestError: there are none, or they were trained with this dataset under another split.
     """
     from face_prediction.models.loading import SHIPPED, checkpoint_folder, load_predictor
 
@@ -214,16 +215,37 @@ def load_network(folder: Path, dataset_sha256: str) -> FittedPredictor:
     tested = record.folds["test"]
     is_of_dataset = record.dataset_sha256 == dataset_sha256 and bool(tested)
     path = checkpoint_folder(folder)
+    if is_of_dataset:
+        _require_same_split(path, record, split)
+    is_by_window = is_of_dataset and split.by == "sequence"
+    subjects = frozenset() if is_by_window else frozenset(record.train_subjects)
     entry = {
         "folder": SHIPPED if str(folder) == SHIPPED else path.resolve().name,
         "name": network.name,
         "preset": record.preset,
         "test_fold": tested[0] if is_of_dataset else None,
+        "split": record.split,
         "train_subjects": len(record.train_subjects),
         "sha256": file_digest(path / "model.safetensors"),
     }
     shared = {"settings": record.settings, "training": record.training, "dataset": record.dataset}
-    return FittedPredictor(network, frozenset(record.train_subjects), path, entry, shared)
+    return FittedPredictor(network, subjects, path, entry, shared)
+
+
+def _require_same_split(folder: Path, record: CheckpointRecord, split: DatasetSplit) -> None:
+    """Raise RequestError if weights of this dataset were trained under another split of it."""
+    if record.split == split.by == "sequence" and record.windows_sha256 != split.windows_sha256:
+        raise RequestError(
+            f"{folder}: the windows of its parts are not those of this dataset's split by "
+            "sequence; train it again"
+        )
+    if record.split != split.by:
+        whom = {"person": "people", "sequence": "windows"}
+        raise RequestError(
+            f"{folder}: was trained with --split {record.split}, which leaves out "
+            f"{whom[record.split]}, so that it is judged by face-prediction evaluate --split "
+            f"{record.split} alone, not by --split {split.by}"
+        )
 
 
 def group_networks(
@@ -271,42 +293,33 @@ def require_strangers(dataset: FaceDataset, fitted: FittedPredictor) -> str:
     )
 
 
-def dataset_landmarks(
-    dataset: FaceDataset, folds: Collection[int], clips: Collection[str] | None = None
-) -> LandmarkSequences:
-    """All sequences of the people in ``folds``, of ``clips`` if given.
+def dataset_landmarks(dataset: FaceDataset, indices: NDArray[np.integer]) -> LandmarkSequences:
+    """The landmarks of sequences.
 
     Raises:
         RequestError: there is none.
     """
-    indices = [
-        index
-        for index in dataset.indices(folds=folds).tolist()
-        if clips is None or dataset.entry(index).clip in clips
-    ]
-    if not indices:
+    if not len(indices):
         raise RequestError(f"{dataset.folder}: no sequence of anybody to fit to")
     # copies of u and v: a view would keep the depth in memory, too
-    landmarks = np.stack([dataset.landmarks(index)[..., :2].copy() for index in indices])
-    return LandmarkSequences(landmarks, tuple(dataset.entry(index).subject for index in indices))
+    numbers = indices.tolist()
+    landmarks = np.stack([dataset.landmarks(index)[..., :2].copy() for index in numbers])
+    return LandmarkSequences(landmarks, tuple(dataset.entry(index).subject for index in numbers))
 
 
 def fit_baselines(
-    dataset: FaceDataset, names: Iterable[str], folds: Sequence[int]
+    dataset: FaceDataset, names: Iterable[str], folds: Sequence[int], split: DatasetSplit
 ) -> list[EvaluatedPredictor]:
-    """Each baseline, fitted for each of ``folds`` to the people of all the others.
+    """Each baseline, fitted for each of ``folds`` to what may be trained on where it is left out.
 
     Raises:
         RequestError: there is no forecaster of a name, or nobody in other folds to fit it to.
     """
     by_fold = {require_choice("baseline", name, FORECASTERS): {} for name in names}
     fitted = [name for name in by_fold if name not in UNFITTED]
-    everybody = range(dataset.manifest.folds)
-    landmarks = dataset_landmarks(dataset, everybody)
-    of_fold = {clip.subject: clip.fold for clip in dataset.manifest.clips}
-    fold_of = np.array([of_fold[subject] for subject in landmarks.subjects])
+    landmarks = dataset_landmarks(dataset, np.arange(len(dataset)))
     for fold in folds:
-        known = np.flatnonzero(fold_of != fold).tolist()
+        known = split.training({fold}).tolist()
         if fitted and not known:
             raise RequestError(
                 f"{dataset.folder}: all its people are in fold {fold}, so nobody is left to fit "
@@ -321,12 +334,13 @@ def fit_baselines(
                 continue
             others = LandmarkSequences(landmarks.landmarks[known], subjects)
             predictor = BaselinePredictor(fit_forecaster(name, others))
-            rows[fold] = FittedPredictor(predictor, frozenset(subjects))
+            people = frozenset(subjects) if split.by == "person" else frozenset[str]()
+            rows[fold] = FittedPredictor(predictor, people)
     return [EvaluatedPredictor(name, rows, "baseline") for name, rows in by_fold.items()]
 
 
 def baselines_from(
-    source: Path, names: Iterable[str], folds: Sequence[int]
+    source: Path, names: Iterable[str], folds: Sequence[int], dataset: FaceDataset
 ) -> list[EvaluatedPredictor]:
     """Baselines with parameters, fitted to all people of another dataset, or shipped.
 
@@ -334,21 +348,29 @@ def baselines_from(
         source: folder made by build-dataset; ``shipped``; or a folder written by fit.
         names: of baselines; those without parameters are left out.
         folds: of the dataset that they are judged on.
+        dataset: that one.
 
     Raises:
-        RequestError: the source is neither.
+        RequestError: the source is neither, or holds somebody of the dataset.
     """
     from face_prediction.models.loading import load_baselines
 
     wanted = [name for name in names if name not in UNFITTED]
     if (source / MANIFEST_NAME).is_file():
         with FaceDataset(source) as other:
-            sequences = dataset_landmarks(other, range(other.manifest.folds))
+            sequences = dataset_landmarks(other, np.arange(len(other)))
         forecasters = [fit_forecaster(name, sequences) for name in wanted]
         subjects = frozenset(sequences.subjects)
     else:
         stored, subjects = load_baselines(source)
         forecasters = [forecaster for forecaster in stored if forecaster.name in wanted]
+    people = {clip.subject for clip in dataset.manifest.clips if clip.sequences}
+    if known := sorted(people & subjects):
+        some = ", ".join(known[:5] + ["..."] * (len(known) > 5))
+        raise RequestError(
+            f"--baselines_from {source}: is fitted to {len(known)} of the {len(people)} people of "
+            f"{dataset.folder} ({some}); give a dataset of others, or leave it out"
+        )
     result: list[EvaluatedPredictor] = []
     for forecaster in forecasters:
         fitted = FittedPredictor(BaselinePredictor(forecaster), subjects, source)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from face_prediction.dataset.image_batches import SequenceBatch, reduction
 from face_prediction.dataset.manifest import SequenceRow
 from face_prediction.dataset.reader import FaceDataset
+from face_prediction.dataset.split import DatasetSplit, split_dataset
 from face_prediction.evaluation.predictors import (
     BaselinePredictor,
     EvaluatedPredictor,
@@ -67,18 +68,21 @@ def select_sequences(
     kinds: Collection[str],
     max_sequences: int | None = None,
     seed: int = 0,
+    split: DatasetSplit | None = None,
 ) -> SequenceSelection:
     """The sequences of these folds and kinds, of each kind at most ``max_sequences``.
 
-    Where there are more, so many are drawn at random from ``seed``.
+    Where there are more, so many are drawn at random from ``seed``. With ``split`` folds are its
+    parts, and ``fold`` of the rows is the part.
 
     Raises:
         RequestError: there are none.
     """
+    split = split or split_dataset(dataset)
     rng = stream_generator(seed, "sequences")
     parts = [np.empty(0, dtype=np.int64)]
     for kind in kinds:
-        found = dataset.indices(folds=folds, kinds=(kind,))
+        found = np.intersect1d(split.members(folds), dataset.indices(kinds=(kind,)))
         if max_sequences is not None and len(found) > max_sequences:
             found = np.sort(rng.choice(found, max_sequences, replace=False))
         parts.append(found)
@@ -89,7 +93,8 @@ def select_sequences(
             f"{', '.join(map(str, sorted(folds)))}"
         )
     rows = dataset.rows()
-    return SequenceSelection(indices, tuple(rows[index] for index in indices.tolist()))
+    chosen = (replace(rows[i], fold=int(split.part[i])) for i in indices.tolist())
+    return SequenceSelection(indices, tuple(chosen))
 
 
 def shuffled_partners(
@@ -138,22 +143,28 @@ def common_folds(predictors: Sequence[EvaluatedPredictor]) -> tuple[int, ...]:
     return tuple(sorted(common))
 
 
-def require_unseen(dataset: FaceDataset, predictors: Sequence[EvaluatedPredictor]) -> None:
+def require_unseen(
+    dataset: FaceDataset, split: DatasetSplit, predictors: Sequence[EvaluatedPredictor]
+) -> None:
     """Check before anything is forecast that nobody meets a predictor that knows the person.
 
     Raises:
         RequestError: a predictor is for a fold that is not there, or learnt from somebody in it.
     """
-    last = dataset.manifest.folds - 1
+    last = split.parts - 1
+    owners = [clip.subject for clip in dataset.manifest.clips]
+    met = sorted(
+        {(p, owners[c]) for p, c in zip(split.part.tolist(), split.clip.tolist(), strict=True)}
+    )
     for predictor in predictors:
         for fold in predictor.by_fold:
             if not 0 <= fold <= last:
                 raise RequestError(
                     f"{predictor.name} is for fold {fold}; {dataset.folder} has folds 0 to {last}"
                 )
-        for clip in dataset.manifest.clips:
-            if clip.sequences and clip.fold in predictor.by_fold:
-                predictor.predictor_for(clip.fold, clip.subject)
+        for part, subject in met:
+            if part in predictor.by_fold:
+                predictor.predictor_for(part, subject)
 
 
 @dataclass(frozen=True)
@@ -232,10 +243,11 @@ def prepare_evaluation(
 def provenance(
     dataset: FaceDataset,
     dataset_sha256: str,
+    split: DatasetSplit,
     loaded: Sequence[FittedPredictor],
     options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The part of ``results.json`` that names dataset, checkpoints, options and versions."""
+    """The part of ``results.json`` that names dataset, split, checkpoints, options, versions."""
     versions = software_versions()
     for name in DEPENDS:
         with suppress(PackageNotFoundError):  # some are needed by some predictors only
@@ -247,6 +259,12 @@ def provenance(
             "sequences": len(dataset),
             "settings": dataset.manifest.settings.to_json(),
         },
+        "split": {
+            "by": split.by,
+            "parts": split.parts,
+            "seed": split.seed,
+            "windows_sha256": split.windows_sha256,
+        },
         "checkpoints": [fitted.checkpoint for fitted in loaded],
         "options": dict(options),
         "versions": versions,
@@ -256,13 +274,16 @@ def provenance(
 def notes_on_selection(
     networks: Sequence[EvaluatedPredictor],
     folds: Sequence[int],
-    all_folds: int,
+    split: DatasetSplit,
     max_sequences: int | None,
 ) -> list[str]:
     """Sentences for readers of the tables about what was left out."""
     result = []
-    if len(folds) < all_folds:
-        result.append(f"{len(folds)} of the dataset's {all_folds} folds are reported on.")
+    if len(folds) < split.parts:
+        of = "the dataset's {} folds" if split.by == "person" else "{} parts of windows"
+        result.append(f"{len(folds)} of {of.format(split.parts)} are reported on.")
+    if split.by == "sequence":
+        result.append("Whole tracks hold frames that were trained on, and are left out.")
     for network in networks:
         more = [str(fold) for fold in network.by_fold if fold not in folds]
         if more:

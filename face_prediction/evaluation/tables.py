@@ -56,14 +56,20 @@ PER_FRAME: tuple[tuple[str, str, tuple[Any, ...], Format], ...] = (
 )
 """Metrics of Table II: heading, key of `KindSummary.numbers`, axis U or V, format."""
 TABULATED_LEVELS = (0.5, 0.9)  # nominal coverages
-INTRODUCTION = """Everybody is forecast by predictors that never saw the person. Errors are of the
-mouth centre (mean of the lip landmarks), as shares of the crop; a frame without a forecast is
-missing and enters no mean. In brackets: 95 % intervals from resampling people, and sequences within
-each. Kinds of footage are apart, because pooling flatters. Variances are of the frames, divided by
-their number. NME: mean distance over all landmarks / distance between the outer eye corners.
-SSIM: scikit-image, Gaussian window of 1.5 pixels, in colour. All images are compared at one size,
-the smallest that any row makes, larger ones brought there by averaging areas; persistence copies
-the last image. Rows of the paper are its printed figures, from its own recordings."""
+SPLITS = {
+    "person": "Everybody is forecast by predictors that never saw the person.",
+    "sequence": """Split by sequence, as the paper's: people in these windows of 75 frames were
+trained on, too, in windows that share no frame with them.""",
+}
+FOLDS = {"person": "Folds", "sequence": "Parts"}
+INTRODUCTION = """Errors are of the mouth centre (mean of the lip landmarks), as shares of the crop;
+a frame without a forecast is missing and enters no mean. In brackets: 95 % intervals from
+resampling people, and sequences within each. Kinds of footage are apart, because pooling flatters.
+Variances are of the frames, divided by their number. NME: mean distance over all landmarks /
+distance between the outer eye corners. SSIM: scikit-image, Gaussian window of 1.5 pixels, in
+colour. All images are compared at one size, the smallest that any row makes, larger ones brought
+there by averaging areas; persistence copies the last image. Rows of the paper are its printed
+figures, from its own recordings."""
 
 RESULTS = "results.json"
 
@@ -110,11 +116,11 @@ EVALUATION = FolderKind("evaluation of face-prediction evaluate", _is_evaluation
 
 def markdown_text(report: EvaluationReport) -> str:
     """``tables.md``."""
-    folds = ", ".join(map(str, report.folds))
+    folds, split = ", ".join(map(str, report.folds)), report.provenance["split"]["by"]
     parts = [
         "# Forecasts of faces, evaluated",
-        INTRODUCTION,
-        f"Folds reported on: {folds}. Every row is on the same sequences.",
+        f"{SPLITS[split]} {INTRODUCTION}",
+        f"{FOLDS[split]} reported on: {folds}. Every row is on the same sequences.",
     ]
     notes = report.provenance.get("notes", [])
     if notes:

@@ -126,12 +126,16 @@ class CrossAttention(nn.Module):
         A = softmax(L I' / sqrt(d)),  C = A I
 
     L and I are the linearly projected features, d their width, one head. The landmarks act through
-    the weights A only: the output is made of image features, as equations 1 to 3 have it. (The
-    usual connection around the attention, C + L, is not in them.)
+    the weights A only: the output is made of image features, as equations 1 to 3 have it. Where all
+    images are alike it is the same whatever the landmarks are. With ``residual`` it is C + L, the
+    usual connection around an attention, by which landmarks reach the output themselves.
     """
 
-    def __init__(self, landmark_width: int, image_width: int, width: int) -> None:
+    def __init__(
+        self, landmark_width: int, image_width: int, width: int, residual: bool = False
+    ) -> None:
         super().__init__()
+        self.residual = residual
         self.query = nn.Linear(landmark_width, width)
         self.key_and_value = nn.Linear(image_width, width)
 
@@ -140,7 +144,8 @@ class CrossAttention(nn.Module):
         query = self.query(landmarks)
         image = self.key_and_value(images)  # one projection: equation 2 has the I of equation 1
         weights = (query @ image.transpose(-2, -1) / query.shape[-1] ** 0.5).softmax(dim=-1)
-        return weights @ image
+        fused = weights @ image
+        return fused + query if self.residual else fused
 
 
 def sinusoids(length: int, width: int) -> Tensor:
@@ -266,7 +271,9 @@ class CrossAttentionModel(FusionModel):
     def __init__(self, settings: CrossAttentionSettings) -> None:
         super().__init__(settings)
         d = settings.attention_width
-        self.attention = CrossAttention(settings.landmark_width, settings.width, d)
+        self.attention = CrossAttention(
+            settings.landmark_width, settings.width, d, settings.residual
+        )
         self.join = nn.Linear(d, settings.width)
         for name, width in (("landmark", settings.landmark_width), ("image", settings.width)):
             positions = sinusoids(settings.history, width)

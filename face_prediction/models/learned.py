@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import TypedDict
 
+from face_prediction.dataset.split import SplitName
 from face_prediction.models.interface import History, Output, PredictorModel
 from face_prediction.models.settings import make_predictor_model, settings_class
 from face_prediction.prediction.interface import Forecast
@@ -55,7 +56,7 @@ class LearnedPredictor:
         batch_size: histories that go through the network at once.
 
     Attributes:
-        name: of the network, in the registry.
+        name: of the network, in the registry; with a residual connection that says so.
         memory: frames of landmarks that it sees; a history must have as many or more.
         horizon: most frames that it predicts.
     """
@@ -65,7 +66,7 @@ class LearnedPredictor:
     ) -> None:
         self.model = model.eval()
         self.record = record
-        self.name = record.model
+        self.name = record.model + "_residual" * bool(record.settings.get("residual"))
         self.memory, self.needs, self.horizon = model.history, model.needs, model.horizon
         self._batch_size = batch_size
 
@@ -171,7 +172,7 @@ def _arrays(output: Output, horizon: int) -> dict[str, NDArray[Any]]:
 
 
 class FoldUses(TypedDict):
-    """Folds of people by their use."""
+    """Folds, or parts of a split by sequence, by their use."""
 
     train: list[NonNegativeInt]
     validation: list[NonNegativeInt]
@@ -189,10 +190,13 @@ class CheckpointRecord:
         dataset: JSON of the dataset's `SequenceSettings`.
         dataset_sha256: of its ``dataset.json``.
         folds: folds by use: ``train``, ``validation``, ``test``.
-        train_subjects: people trained on, on whom the network must not be evaluated.
+        train_subjects: people trained on, on whom the network must not be evaluated (by person).
         step: optimizer steps that made these weights.
         validation: losses and errors (crops) on the held-out fold, if there is one.
         versions: of the software, by package.
+        split: person: ``folds`` are those of the dataset. sequence: they are parts of its split by
+            sequence, and ``train_subjects`` may be in all of them.
+        windows_sha256: of the windows of such parts.
     """
 
     model: str
@@ -207,6 +211,8 @@ class CheckpointRecord:
     step: NonNegativeInt
     validation: dict[str, float]
     versions: dict[str, str]
+    split: SplitName = "person"
+    windows_sha256: str = ""
 
 
 def save_predictor_checkpoint(

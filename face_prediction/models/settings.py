@@ -186,11 +186,23 @@ class FusionSettings(ApproachSettings):
 
 @dataclass(frozen=True)
 class CrossAttentionSettings(FusionSettings):
-    """Settings of cross-attention; ``attention_width``: of queries, keys, values (d of eq. 1)."""
+    """Settings of cross-attention.
+
+    Attributes:
+        attention_width: of queries, keys and values (d of equation 1).
+        residual: add the projected landmarks to what the attention gives, as Transformers do around
+            every attention. Equations 1 to 3 do not.
+    """
 
     cpu: ClassVar[Mapping[str, Any]] = {**FusionSettings.cpu, "attention_width": 128}
 
     attention_width: Annotated[int, Interval(ge=1, le=2048)] = 256
+    residual: bool = False
+
+    @classmethod
+    def from_json(cls, data: Any) -> Self:
+        """Undo `to_json`; networks of releases without ``residual`` have none."""
+        return super().from_json({"residual": False} | data if isinstance(data, dict) else data)
 
 
 MODELS: dict[str, tuple[type[ModelSettings], str]] = {

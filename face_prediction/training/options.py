@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
+from face_prediction.dataset.split import SplitName
 from face_prediction.models.settings import (
     Decay,
     ModelSettings,
@@ -39,12 +40,15 @@ class FaceTrainOptions:
     Attributes:
         model: Network; see docs/predictors.md.
         dataset: Folder made by build-dataset.
-        test_fold: Fold whose people are left for the report. None: nobody is, for weights that are
-            shipped.
+        test_fold: Fold whose people are left for the report, or part of a split by sequence. None:
+            nobody is, for weights that are shipped.
+        split: person: parts are the dataset's folds. sequence: ten parts of windows that do not
+            overlap, drawn from the same people, as the paper's.
         hold_out: next: the fold after it chooses the weights that are kept. none: it is trained on
             too, and the last weights are kept.
         preset: Sizes: paper (256 x 256, for a GPU) or cpu (64 x 64, for a core or two).
-        out: Folder for the network; None: checkpoints/MODEL_PRESET_foldK_seedN.
+        out: Folder for the network; None: checkpoints/MODEL_PRESET_foldK_seedN (sequenceK with
+            --split sequence).
         seed: Seed of weights, order, windows, dropout and augmentation.
         subjects: Train on the first so many people of an order drawn from the seed; None: on all.
         settings: Settings of the network that differ from the preset's, as NAME=VALUE (width=96).
@@ -69,6 +73,7 @@ class FaceTrainOptions:
     model: tyro.conf.Positional[Literal["image_only", "simple_fusion", "cross_attention"]]
     dataset: Path = Path("face_dataset")
     test_fold: NonNegativeInt | None = 0
+    split: SplitName = "person"
     hold_out: Literal["next", "none"] = "next"
     preset: Literal["paper", "cpu"] = "cpu"
     out: Path | None = None
@@ -95,7 +100,8 @@ class FaceTrainOptions:
     @property
     def folder(self) -> Path:
         """Folder of the run."""
-        fold = "all" if self.test_fold is None else f"fold{self.test_fold}"
+        part = "fold" if self.split == "person" else "sequence"
+        fold = "all" if self.test_fold is None else f"{part}{self.test_fold}"
         name = f"{self.model}_{self.preset}_{fold}_seed{self.seed}"
         return self.out or Path("checkpoints") / name
 

@@ -25,6 +25,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
+from face_prediction.dataset.split import NO_PART_LEFT, split_dataset
 from face_prediction.models.interface import PredictorModel
 from face_prediction.models.learned import (
     MODEL_FILE,
@@ -36,7 +37,11 @@ from face_prediction.models.learned import (
     save_predictor_checkpoint,
     write_tensors,
 )
-from face_prediction.models.settings import PredictorTrainSettings, make_predictor_model
+from face_prediction.models.settings import (
+    PredictorTrainSettings,
+    make_predictor_model,
+    settings_class,
+)
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import SequenceWindows, WindowBatch, augment, window_batches
@@ -104,6 +109,8 @@ def train_predictor(options: FaceTrainOptions) -> int:
             step=0,
             validation={},
             versions=software_versions("torch"),
+            split=options.split,
+            windows_sha256=people.windows_sha256,
         )
         stack.enter_context(locked(folder))
         remove_temporaries(folder)
@@ -142,41 +149,46 @@ def train_predictor(options: FaceTrainOptions) -> int:
 
 @dataclass(frozen=True)
 class People:
-    """Sequences to train on and to validate on; never one person in both.
+    """Sequences to train on and to validate on; never one person, or one frame, in both.
 
     Attributes:
         train: (N,) sequences of the dataset.
         validation: (M,) sequences; empty where nobody is held out.
         folds: folds by use: ``train``, ``validation``, ``test``.
         train_subjects: people trained on.
+        windows_sha256: of the windows of a split by sequence.
     """
 
     train: NDArray[np.int64]
     validation: NDArray[np.int64]
     folds: FoldUses
     train_subjects: list[str]
+    windows_sha256: str = ""
 
 
 def choose_people(dataset: FaceDataset, options: FaceTrainOptions) -> People:
-    """Divide the dataset by ``test_fold``, ``hold_out``, ``subjects`` and ``seed`` of the options.
+    """Divide the dataset by ``split``, ``test_fold``, ``hold_out``, ``subjects`` and ``seed``.
 
     Raises:
         RequestError: there is no such fold, nobody to train on, or fewer subjects.
     """
-    count = dataset.manifest.folds
+    split = split_dataset(dataset, options.split)
+    count = split.parts
     train, validation, test = tuple(range(count)), (), ()
     if options.test_fold is not None:
-        split = dataset.split(options.test_fold)
-        train, validation, test = split.train, split.validation, split.test
+        uses = split.uses(options.test_fold)
+        train, validation, test = uses.train, uses.validation, uses.test
         if options.hold_out == "none":
             train, validation = tuple(sorted({*train, *validation})), ()
         elif not validation:
             raise RequestError(
                 f"{dataset.folder}: {count} folds leave none to hold out; say --hold_out none"
             )
+    elif options.split == "sequence":
+        raise RequestError(f"--split sequence --test_fold None: {NO_PART_LEFT}")
     elif options.hold_out == "next":
         raise RequestError("--test_fold None trains on everybody; say --hold_out none with it")
-    rows = dataset.indices(folds=train)
+    rows = split.training({*validation, *test})
     owners = [dataset.entry(int(row)).subject for row in rows]
     names = sorted(set(owners))
     if not names:
@@ -188,7 +200,7 @@ def choose_people(dataset: FaceDataset, options: FaceTrainOptions) -> People:
         names = sorted(names[place] for place in order[:subjects])
         rows = rows[[owner in names for owner in owners]]
     folds = FoldUses(train=list(train), validation=list(validation), test=list(test))
-    return People(rows, dataset.indices(folds=validation), folds, names)
+    return People(rows, split.members(validation), folds, names, split.windows_sha256)
 
 
 def _device(name: str) -> torch.device:
@@ -262,7 +274,7 @@ def _previous_state(
         return None
     tensors, state, _ = read_tensors(path)
     stored = convert(SCHEMA.without(state, f"'{path}'"), StoredTrainer, f"'{path}'")
-    for name, old, new in _differences(stored.run, _run_record(record)):
+    for name, old, new in _differences(_in_this_release(stored.run), _run_record(record)):
         if name != EXTENDABLE:
             raise RequestError(
                 f"--out {folder}: holds a run with {name} {old}, not {new}; "
@@ -288,7 +300,14 @@ class StoredTrainer:
 def _run_record(record: CheckpointRecord) -> dict[str, Any]:
     """Return what must be the same when a run is carried on."""
     left_out = ("step", "validation", "versions")
-    return {name: value for name, value in asdict(record).items() if name not in left_out}
+    run = {name: value for name, value in asdict(record).items() if name not in left_out}
+    return {"split": run.pop("split"), **run}  # first: it explains other folds
+
+
+def _in_this_release(run: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of a run, perhaps of a release without some of its fields, with these."""
+    settings = settings_class(run["model"]).from_json(run["settings"]).to_json()
+    return {"split": "person", "windows_sha256": ""} | run | {"settings": settings}
 
 
 def _differences(there: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:

@@ -205,7 +205,12 @@ def report(scores: EvaluationScores) -> EvaluationReport:
     kinds = tuple(
         summarise_kind(scores, kind, resamples=50, seed=4) for kind in ("natural", "grid")
     )
-    return EvaluationReport(kinds, 70, (0, 2), {"notes": ["a note"], "dataset": {"sha256": "ab"}})
+    return EvaluationReport(
+        kinds,
+        70,
+        (0, 2),
+        {"notes": ["a note"], "dataset": {"sha256": "ab"}, "split": {"by": "person"}},
+    )
 
 
 def test_markdown_has_the_tables_of_each_kind_apart(report: EvaluationReport) -> None:

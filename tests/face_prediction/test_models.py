@@ -75,6 +75,32 @@ def test_cross_attention_is_equations_1_to_3() -> None:
     np.testing.assert_allclose(got, expected, rtol=1e-12)
 
 
+def test_landmarks_reach_the_output_by_a_residual_connection_alone() -> None:
+    """Of images that are all alike equations 1 to 3 make the same, whatever the landmarks are."""
+    alike = torch.randn(1, 1, 7).expand(2, 9, 7)
+    landmarks = torch.randn(2, 9, 5)
+    torch.manual_seed(0)
+    plain = CrossAttention(landmark_width=5, image_width=7, width=4)
+    fused = plain(landmarks, alike)
+    torch.testing.assert_close(fused, plain.key_and_value(alike))
+    torch.manual_seed(0)
+    connected = CrossAttention(landmark_width=5, image_width=7, width=4, residual=True)
+    torch.testing.assert_close(connected(landmarks, alike), fused + plain.query(landmarks))
+    names = [
+        sorted(dict(tiny("cross_attention", residual=r).named_parameters())) for r in (False, True)
+    ]
+    assert names[0] == names[1]  # no weights more
+
+
+def test_settings_of_releases_without_a_residual_connection() -> None:
+    settings = CrossAttentionSettings()
+    assert not settings.residual
+    older = {name: value for name, value in settings.to_json().items() if name != "residual"}
+    assert CrossAttentionSettings.from_json(older) == settings
+    with pytest.raises(RequestError, match="settings: width: is missing"):
+        CrossAttentionSettings.from_json({k: v for k, v in older.items() if k != "width"})
+
+
 def test_positions_are_those_of_vaswani() -> None:
     expected = [
         [

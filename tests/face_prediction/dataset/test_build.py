@@ -14,6 +14,7 @@ from face_prediction.dataset.build import cut_images
 from face_prediction.dataset.manifest import read_manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings, clip_frames, find_sequences
+from face_prediction.dataset.split import split_dataset
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import save_track
 from face_prediction.tracking.video import VideoReader
@@ -86,8 +87,11 @@ def test_a_person_is_in_one_fold(folder) -> None:
         subjects = [{dataset.entry(i).subject for i in part} for part in parts]
         assert sorted(map(sorted, subjects)) == [["ann"], ["bob"], ["cat"]]
         assert {dataset.entry(int(i)).clip for i in dataset.indices(kinds={"grid"})} == {"grid_a"}
-        split = dataset.split(0)
-        assert (split.train, split.validation, split.test) == ((2,), (1,), (0,))
+        split = split_dataset(dataset)
+        assert [split.members({fold}).tolist() for fold in range(3)] == list(map(sorted, parts))
+        assert split.training({0}).tolist() == sorted(parts[1] | parts[2])
+        use = split.uses(0)
+        assert (use.train, use.validation, use.test) == ((2,), (1,), (0,))
 
 
 def test_a_second_run_makes_nothing_and_a_third_only_what_is_missing(folder, caplog) -> None:

@@ -14,6 +14,7 @@ import face_prediction.commands.evaluate as command
 from face_prediction.commands.cli import main
 from face_prediction.commands.evaluate import EvaluateOptions, run_evaluate
 from face_prediction.dataset.reader import FaceDataset
+from face_prediction.dataset.split import DatasetSplit
 from face_prediction.evaluation.predictors import FittedPredictor
 from face_prediction.forecast.interface import mouth_centre
 from face_prediction.prediction.interface import Forecast, ImageNeeds
@@ -135,7 +136,7 @@ def toys(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Toy]:
         found[f"blind_{fold}"] = Toy("blind", fold, people[fold])
         found[f"careless_{fold}"] = Toy("careless", fold, people[fold], reads=False)
 
-    def load(folder: Path, dataset_sha256: str) -> FittedPredictor:
+    def load(folder: Path, dataset_sha256: str, split: DatasetSplit) -> FittedPredictor:
         assert dataset_sha256 == file_digest(dataset / "dataset.json")
         toy = found[folder.name]
         record = {"name": toy.name, "preset": toy.preset, "test_fold": toy.test_fold}

@@ -11,6 +11,9 @@ import tyro
 from face_prediction.commands import cli
 from face_prediction.commands.evaluate import EvaluateOptions
 from face_prediction.dataset.reader import FaceDataset
+from face_prediction.dataset.split import split_dataset
+from face_prediction.evaluation import predictors
+from face_prediction.forecast import Forecaster, LandmarkSequences
 from face_prediction.forecast.interface import mouth_centre
 
 from .conftest import rows_of, run
@@ -41,6 +44,43 @@ def test_baselines_alone(dataset: Path, tmp_path: Path, capsys) -> None:
     assert "ssim" not in rows["constant_velocity"]["numbers"]
     assert record["kinds"]["natural"]["ssim_size"] == 64
     assert "| persistence | 0.0" in capsys.readouterr().out
+    # whole tracks have the copy of the last frame, too, which copies no image there
+    assert [row["name"] for row in record["tracks"]["natural"]["rows"]] == list(rows)
+
+
+def test_windows_of_people_who_were_trained_on(dataset: Path, tmp_path: Path, monkeypatch) -> None:
+    """Ten windows of 13 frames, two a clip; a baseline is fitted to no frame that it forecasts."""
+    fitted: list[set[bytes]] = []
+    fit = predictors.fit_forecaster
+
+    def watch(name: str, sequences: LandmarkSequences) -> Forecaster:
+        if name == "ar_mouth":
+            frames = sequences.landmarks.reshape(-1, 468, 2)
+            centred = frames - frames[:, :1]  # one frame has other places in other crops
+            fitted.append({np.round(frame, 4).tobytes() for frame in centred})
+        return fit(name, sequences)
+
+    monkeypatch.setattr(predictors, "fit_forecaster", watch)
+    record = run(dataset, tmp_path, baselines=("ar_mouth",), split="sequence")
+    assert record["split"]["by"] == "sequence"
+    assert record["split"]["parts"] == len(fitted) == 10
+    assert {k: v["sequences"] for k, v in record["kinds"].items()} == {
+        "natural": 6, "head_motion": 4,
+    }  # fmt: skip
+    assert "tracks" not in record
+    assert record["notes"] == ["Whole tracks hold frames that were trained on, and are left out."]
+    text = (tmp_path / "tables.md").read_text()
+    assert "trained on, too, in windows that share no frame" in text
+    assert "Parts reported on: 0, 1" in text
+    assert "never saw the person" not in text
+    with FaceDataset(dataset) as opened:
+        split = split_dataset(opened, "sequence")
+        for part, frames in enumerate(fitted):
+            assert len(frames) >= 13
+            for index in split.members({part}).tolist():
+                points = opened.landmarks(index)[..., :2]
+                shapes = [np.round(frame - frame[:1], 4).tobytes() for frame in points]
+                assert not frames & set(shapes)
 
 
 def test_networks_beside_baselines(dataset: Path, tmp_path: Path, toys) -> None:

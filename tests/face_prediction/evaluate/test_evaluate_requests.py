@@ -10,6 +10,7 @@ import pytest
 import face_prediction.commands.evaluate as command
 from face_prediction.commands.cli import main
 from face_prediction.dataset.reader import FaceDataset
+from face_prediction.dataset.split import split_dataset
 from face_prediction.evaluation.predictors import (
     FittedPredictor,
     load_network,
@@ -83,7 +84,12 @@ def test_a_dataset_with_one_fold_has_nobody_to_fit_to(dataset: Path, tmp_path: P
     record = run(tmp_path / "one", tmp_path / "out", baselines=("all",), tracks=False)
     assert set(rows_of(record)) == {"persistence", "constant_velocity", "line"}
     assert record["notes"] == ["One fold: only baselines without parameters are fitted to it."]
-    with pytest.raises(RequestError, match="was trained on subject"):  # themselves
+    with pytest.raises(RequestError, match="unknown baseline 'best'"):
+        run(tmp_path / "one", tmp_path / "out", baselines=("best",), baselines_from=dataset)
+    more = {"baselines": ("ar_mouth",), "baselines_from": dataset, "tracks": False}
+    record = run(tmp_path / "one", tmp_path / "more", **more)
+    assert set(rows_of(record)) == {"persistence", "ar_mouth (dataset)"}
+    with pytest.raises(RequestError, match="is fitted to 5 of the 5 people"):  # themselves
         run(dataset, tmp_path / "both", baselines=("ar_mouth",), baselines_from=dataset)
 
 
@@ -98,13 +104,14 @@ class Record:
     settings: tuple = ()
     training: tuple = ()
     dataset: tuple = ()
+    split: str = "person"
 
 
 @pytest.mark.parametrize(
     ("digest", "tested", "found"), [("b", [1], 1), ("a", [1], None), ("b", [], None)]
 )
 def test_weights_are_for_a_fold_of_their_own_dataset_alone(
-    tmp_path: Path, monkeypatch, digest: str, tested: list[int], found: int | None
+    dataset: Path, tmp_path: Path, monkeypatch, digest: str, tested: list[int], found: int | None
 ) -> None:
     loading = pytest.importorskip("face_prediction.models.loading")
     pytest.importorskip("torch", reason="PyTorch is not installed (extra face-prediction)")
@@ -112,7 +119,8 @@ def test_weights_are_for_a_fold_of_their_own_dataset_alone(
     network = Toy("net", 0, ())
     monkeypatch.setattr(loading, "load_predictor", lambda folder: (network, record))
     (tmp_path / "model.safetensors").write_bytes(b"")
-    fitted = load_network(tmp_path, "b" * 64)
+    with FaceDataset(dataset) as opened:
+        fitted = load_network(tmp_path, "b" * 64, split_dataset(opened))
     assert fitted.checkpoint is not None
     assert fitted.checkpoint["test_fold"] == found
     assert fitted.subjects == {"ann", "zoe"}

@@ -12,6 +12,8 @@ import pytest
 
 from face_prediction.dataset.clip_file import open_clip, read_array
 from face_prediction.dataset.reader import FaceDataset
+from face_prediction.evaluation import figures
+from face_prediction.evaluation.tracks import GROUPS, TrackScores
 from face_prediction.evaluation.video import (
     FORECASTS,
     PAUSE,
@@ -49,6 +51,28 @@ def test_figures_and_video(dataset: Path, tmp_path: Path, toys) -> None:
         frames = sum(1 for _ in video.decode(video=0))
     # six sequences four frames apart: eight frames, four each, the five forecast at the end
     assert frames == 8 + 5 * 4 + 5
+
+
+@pytest.mark.parametrize("people", [3, figures.MOST_NAMES + 1])
+def test_gains_of_a_few_people_have_their_names(tmp_path: Path, monkeypatch, people: int) -> None:
+    drawn = []
+    monkeypatch.setattr(figures, "_save_png", lambda figure, path: drawn.append(figure))
+    errors = np.ones((people, 2, len(GROUPS)))
+    errors[:, 1] = np.linspace(0.5, 1.5, people)[:, None]
+    names = tuple(f"p{i}" for i in range(people))
+    frames, rows = np.full(people, 90), (("persistence", "baseline"), ("net", "network"))
+    counts, inside = np.ones((people, len(GROUPS))), np.full((people, 2, len(GROUPS), 2), np.nan)
+    smooth = np.linspace(0.1, 0.9, people)
+    scores = TrackScores("natural", names, frames, smooth, rows, errors, counts, inside)
+    figures.draw_gains(tmp_path / "gains.png", [scores])
+    (axes,) = drawn[0].axes
+    places = np.asarray(axes.collections[0].get_offsets())
+    np.testing.assert_allclose(places, np.c_[smooth, np.linspace(-50, 50, people)])
+    shown = {text.get_text(): text.xy for text in axes.texts}
+    assert list(shown) == list(names if people == 3 else ())
+    for name, place in shown.items():
+        np.testing.assert_allclose(place, places[names.index(name)])
+    assert axes.get_title().startswith("net: each person")
 
 
 def test_the_timeline_of_a_clip_is_in_its_own_pixels(dataset: Path) -> None:

@@ -15,10 +15,17 @@ import torch
 
 from face_prediction.commands.train import run_train
 from face_prediction.dataset.reader import FaceDataset
-from face_prediction.models.learned import LearnedPredictor, read_predictor_checkpoint, read_tensors
+from face_prediction.dataset.split import split_dataset
+from face_prediction.models.learned import (
+    LearnedPredictor,
+    read_predictor_checkpoint,
+    read_tensors,
+    write_tensors,
+)
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.training.options import FaceTrainOptions
+from face_prediction.training.trainer import choose_people
 from face_prediction.training.windows import WindowBatch
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import locked
@@ -50,6 +57,44 @@ def test_the_dataset_shows_what_it_says(dataset: Path) -> None:
     seen = np.array([np.argwhere(frame).mean(axis=0)[::-1] + 0.5 for frame in red]) / 64
     expected = sequence.landmarks[:, list(LIPS), :2].mean(axis=1)
     np.testing.assert_allclose(seen, expected, atol=1.5 / 64)
+
+
+@quick
+def test_a_split_by_sequence(options: FaceTrainOptions, dataset: Path, monkeypatch, caplog) -> None:
+    caplog.set_level(logging.INFO)
+    options = replace(options, split="sequence", test_fold=9, steps=1, validate_every=1)
+    assert replace(options, out=None).folder.name == "cross_attention_cpu_sequence9_seed0"
+    assert run_train(options) == 0
+    record, _ = read_predictor_checkpoint(options.folder)
+    assert record.split == "sequence"
+    assert record.folds == {"train": [*range(1, 9)], "validation": [0], "test": [9]}
+    assert {"ann", "bob", "eve"} <= set(record.train_subjects)  # in all parts
+    with FaceDataset(dataset) as opened:
+        split = split_dataset(opened, "sequence")
+        used = choose_people(opened, options)
+    assert record.windows_sha256 == split.windows_sha256
+    assert used.train.tolist() == split.training({9, 0}).tolist()
+    assert used.validation.tolist() == split.members({0}).tolist()
+    with pytest.raises(RequestError, match="holds a run with split sequence, not person; choose"):
+        run_train(replace(options, split="person", test_fold=0))
+    with pytest.raises(RequestError, match="leaves a part for the report; valid: 0 to 9"):
+        run_train(replace(options, test_fold=None, hold_out="none"))
+    with pytest.raises(RequestError, match="fold 10: this dataset has folds 0 to 9"):
+        run_train(replace(options, test_fold=10))
+
+
+@quick
+def test_a_run_of_a_release_without_splits_is_carried_on(options: FaceTrainOptions) -> None:
+    options = replace(options, steps=1)
+    assert run_train(options) == 0
+    state, record, _ = read_tensors(options.folder / "trainer.safetensors")
+    for name in ("split", "windows_sha256"):
+        del record["run"][name]
+    del record["run"]["settings"]["residual"]
+    write_tensors(options.folder / "trainer.safetensors", state, record)
+    with pytest.raises(RequestError, match=r"with settings\.residual False, not True"):
+        run_train(replace(options, settings=(*options.settings, "residual=true")))
+    assert run_train(replace(options, steps=2)) == 0
 
 
 @pytest.mark.parametrize("model", ["image_only", "simple_fusion", "cross_attention"])
