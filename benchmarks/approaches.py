@@ -78,6 +78,8 @@ class Options:
         splits: sequence, the paper's; person.
         seeds: Seeds of the trainings, each also the part or fold that it leaves for the report.
         size: Side of the images.
+        settings: Settings of all networks, as NAME=VALUE: landmark_weight=468 is equation 4 to the
+            letter (not of image_only). Give such trainings another --out.
         steps: Optimiser steps of each training; a larger number extends trainings.
         batch_size: Sequences of a step.
         learning_rates: Learning rates. Of several, the one that does best on the validation part of
@@ -98,6 +100,7 @@ class Options:
     splits: tuple[str, ...] = SPLITS
     seeds: tuple[Seed, ...] = (0, 1, 2)
     size: Count = 32
+    settings: tuple[str, ...] = ()
     steps: Count = 8000
     batch_size: Count = 4
     learning_rates: tuple[Amount, ...] = (1e-3,)
@@ -170,7 +173,7 @@ def train(options: Options, training: Training) -> Path:
         split=training.split,
         out=folder,
         seed=training.seed,
-        settings=(f"size={options.size}", channels, *settings),
+        settings=(f"size={options.size}", channels, *settings, *options.settings),
         steps=options.steps,
         batch_size=options.batch_size,
         learning_rate=training.learning_rate,
@@ -285,9 +288,10 @@ def page(options: Options) -> str:
     """All tables of everything that a folder holds."""
     out = options.out
     parts = [
+        "# The paper's approaches",
         "Mean over the training seeds, in brackets the least and the greatest. The paper's figures "
         "are those that it prints, of its own recordings at 256 pixels; their variances cannot be "
-        "variances in these units."
+        "variances in these units.",
     ]
     for split, kind in product(SPLITS, options.kinds):
         rows = read_rows(out, split, kind)

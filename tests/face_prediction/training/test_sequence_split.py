@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,11 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from face_prediction.commands.fit import FitOptions, run_fit
 from face_prediction.dataset.manifest import ClipEntry, Manifest
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import KINDS, SequenceSettings
 from face_prediction.dataset.split import SEQUENCE_PARTS, DatasetSplit, split_dataset
-from face_prediction.dataset.tracks import FaceStretch, without_windows
+from face_prediction.dataset.tracks import FaceStretch, dataset_stretches, without_windows
 from face_prediction.evaluation.predictors import load_network
 from face_prediction.evaluation.setup import require_unseen, select_sequences
 from robo_manip_baselines.runs.errors import RequestError
@@ -185,3 +186,41 @@ def test_a_part_that_is_not_there_is_refused(opened: FaceDataset) -> None:
     missing = SimpleNamespace(name="net", by_fold={10: None}, predictor_for=lambda *_: None)
     with pytest.raises(RequestError, match=r"net is for fold 10; .* has folds 0 to 9"):
         require_unseen(opened, split, [missing])  # type: ignore[list-item]
+
+
+class FittedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("part", [0, 4])
+def test_fit_sees_no_frame_that_is_reported_on(
+    opened: FaceDataset, tmp_path: Path, monkeypatch, part: int
+) -> None:
+    fits = pytest.importorskip("face_prediction.models.residual.fit")
+    seen: set[tuple[str, bytes]] = set()  # people move alike, some frames later
+
+    def fit(landmarks: list[np.ndarray], subjects: list[str]) -> None:
+        for track, subject in zip(landmarks, subjects, strict=True):
+            seen.update((subject, frame.tobytes()) for frame in track)
+        raise FittedError
+
+    monkeypatch.setattr(fits, "fit_residual", fit)
+    options = FitOptions(opened.folder, test_fold=part, split="sequence", out=tmp_path / "out")
+    with pytest.raises(FittedError):
+        run_fit(options)
+    split = split_dataset(opened, "sequence")
+    windows = split.windows({part})
+    whole = {s.clip: s for s in dataset_stretches(opened)}
+    reported = {
+        (clip, whole[clip].landmarks[frame - whole[clip].start].tobytes())
+        for clip, spans in windows.items()
+        for first, end in spans
+        for frame in range(first, end)
+    }
+    assert len(reported) >= split.length
+    assert not seen & reported
+    assert len(seen) > len(reported)
+    with pytest.raises(RequestError, match="leaves a part for the report; valid: 0 to 9"):
+        run_fit(replace(options, test_fold=None))
+    with pytest.raises(RequestError, match="--test_fold 10: no such fold; valid: 0 to 9"):
+        run_fit(replace(options, test_fold=10))

@@ -193,13 +193,13 @@ class FaceScene:
             raise ValueError(f"action with {place}: {form}")
         return values
 
-    def _physics_rows(self) -> list[int]:
+    def _physics_rows(self) -> Sequence[int]:
         """Rows of the replay's bodies at the ends of the physics steps of a control step."""
         if self.motion_start is None:
             return [0] * self.substeps
         first = (self.step_count - self.motion_start) * self.substeps + 1
-        last = len(self._positions) - 1
-        return [min(row, last) for row in range(first, first + self.substeps)]
+        rows, last = range(first, first + self.substeps), len(self._positions) - 1
+        return rows if rows[-1] <= last else [min(row, last) for row in rows]
 
     def _motion_step(self) -> int:
         """Control steps since the motion started; 0 while it waits."""

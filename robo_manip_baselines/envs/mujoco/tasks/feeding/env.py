@@ -350,7 +350,8 @@ class FeedingEnv(FaceEnv):
 
     def _fingers_on(self, arm: str) -> int:
         """Return how many fingers of an arm touched the cube in the last step."""
-        return sum(bool(self._fingers_on_cube & bit) for bit in _FINGER_BITS[arm])
+        left, right = _FINGER_BITS[arm]
+        return bool(self._fingers_on_cube & left) + bool(self._fingers_on_cube & right)
 
     def _is_inside_mouth(self) -> bool:
         half_width, half_height = self.mouth_opening.tolist()
