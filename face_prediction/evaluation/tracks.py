@@ -27,6 +27,7 @@ from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.dataset.tracks import FaceStretch
 from face_prediction.evaluation.predictors import EvaluatedPredictor
 from face_prediction.evaluation.scoring import interval_levels
+from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.forecast.interface import mouth_centre
 from face_prediction.motion.report import markdown_table
 from face_prediction.prediction.interface import Predictor, StatefulPredictor, TrackForecast
@@ -78,9 +79,9 @@ class TrackScores:
     @property
     def best(self) -> int:
         """The baseline with the least error at frames 3-5."""
-        means = self.errors.sum(axis=0) / self.counts.sum(axis=0)
+        sums = self.errors.sum(axis=0)
         baselines = [i for i, (_, role) in enumerate(self.rows) if role == "baseline"]
-        return min(baselines, key=lambda i: means[i, FAR])
+        return min(baselines, key=lambda i: sums[i, FAR])
 
 
 def forecast_track(
@@ -101,6 +102,28 @@ def forecast_track(
         forecast = predictor.predict(landmarks[rows], None, horizon)
         moved[frames] = mouth_centre(forecast.landmarks) - mouth[frames, None]
     return TrackForecast(moved)
+
+
+def forecast_stretches(
+    evaluated: EvaluatedPredictor, stretches: Sequence[FaceStretch], history: int
+) -> list[TrackForecast]:
+    """Forecast every stretch up to `HORIZON`, by the fit to other people than its own.
+
+    Stretches of a predictor that keeps a state are followed side by side, which is faster.
+    """
+    if evaluated.name == PERSISTENCE:  # whose predictor wants images, to copy them
+        return [TrackForecast(np.zeros((len(stretch), HORIZON, 2))) for stretch in stretches]
+    chosen = [evaluated.predictor_for(stretch.fold, stretch.subject) for stretch in stretches]
+    made: dict[int, TrackForecast] = {}
+    for predictor in {id(own): own for own in chosen}.values():
+        numbers = [number for number, own in enumerate(chosen) if own is predictor]
+        tracks = [stretches[number].landmarks for number in numbers]
+        if isinstance(predictor, StatefulPredictor):
+            forecasts = predictor.forecast_tracks(tracks, HORIZON)
+        else:
+            forecasts = [forecast_track(predictor, track, history, HORIZON) for track in tracks]
+        made.update(zip(numbers, forecasts, strict=True))
+    return [made[number] for number in range(len(stretches))]
 
 
 def track_errors(
@@ -137,12 +160,15 @@ def score_tracks(
     predictors: Sequence[EvaluatedPredictor],
     progress: bool = False,
 ) -> list[TrackScores]:
-    """Score predictors that look at no images, on every stretch, by kind of footage and person."""
+    """Score predictors that look at no images, on every stretch, by kind of footage and person.
+
+    `PERSISTENCE` counts among them: it copies landmarks and images alike.
+    """
     settings = manifest.settings
-    shown = [p for p in predictors if not any(needs.frames for needs in p.needs)]
+    shown = [p for p in predictors if p.name == PERSISTENCE or not any(n.frames for n in p.needs)]
     groups = [slice(first - 1, last) for first, last in GROUPS.values()]
     result: list[TrackScores] = []
-    with ProgressBar(len(stretches) * len(shown), "track", shown=progress, keep=False) as bar:
+    with ProgressBar(len(stretches), "track", shown=progress, keep=False) as bar:
         for kind in dict.fromkeys(stretch.kind for stretch in stretches):
             own = [stretch for stretch in stretches if stretch.kind == kind]
             subjects = sorted({stretch.subject for stretch in own})
@@ -150,15 +176,14 @@ def score_tracks(
             errors, inside = np.zeros(shape), np.zeros((*shape, len(NOMINAL)))
             counts, frames = np.zeros((shape[0], shape[2])), np.zeros(shape[0], dtype=np.int64)
             smooth = np.zeros((shape[0], 2))
-            for stretch in own:
+            forecasts = [forecast_stretches(p, own, settings.history) for p in shown]
+            for number, stretch in enumerate(own):
                 person = subjects.index(stretch.subject)
                 frames[person] += len(stretch) - settings.history + 1
                 steps = smoothness(mouth_centre(stretch.landmarks))
                 smooth[person] += (len(stretch) * steps, len(stretch))
-                for row, predictor in enumerate(shown):
-                    chosen = predictor.predictor_for(stretch.fold, stretch.subject)
-                    made = forecast_track(chosen, stretch.landmarks, settings.history, HORIZON)
-                    missed, levels = track_errors(made, stretch, settings)
+                for row in range(len(shown)):
+                    missed, levels = track_errors(forecasts[row][number], stretch, settings)
                     size = np.abs(missed).mean(axis=-1)
                     for place, group in enumerate(groups):
                         errors[person, row, place] += np.nansum(size[:, group])
@@ -171,7 +196,7 @@ def score_tracks(
                         for k, nominal in enumerate(NOMINAL):
                             share = (part <= nominal).mean(axis=-1)
                             inside[person, row, place, k] += share.sum()
-                    bar.advance(1)
+                bar.advance(1)
             rows = tuple((predictor.name, predictor.role) for predictor in shown)
             result.append(
                 TrackScores(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +14,36 @@ from face_prediction.forecast.interface import mouth_centre
 from face_prediction.live.streaming import FollowingForecaster, StreamingPredictor
 from face_prediction.models.residual.adaptive import (
     BANDS,
+    CALM,
     HORIZONS,
     OVERLAP,
     ROBUST,
     FaceState,
+    Mixture,
     Ring,
 )
 from face_prediction.models.residual.experts import EXPERTS, SERIES, LinearExpert, slow_means
-from face_prediction.models.residual.fit import fit_people, fit_residual
+from face_prediction.models.residual.fit import (
+    Rows,
+    fit_linear,
+    fit_people,
+    fit_residual,
+    missed,
+    mix_again,
+    trial,
+)
 from face_prediction.models.residual.intervals import (
     LEVELS,
     IntervalFit,
     IntervalTracker,
     student_t,
 )
-from face_prediction.models.residual.predictor import ResidualFit, ResidualPredictor
+from face_prediction.models.residual.predictor import (
+    ResidualFit,
+    ResidualPredictor,
+    face_series,
+    face_side,
+)
 from robo_manip_baselines.runs.errors import RequestError
 
 FRAMES = 140
@@ -199,7 +215,7 @@ def test_learning_is_weighted_ridge_regression() -> None:
     rng = np.random.default_rng(3)
     tracks = [np.cumsum(rng.normal(0, 0.01, (150, SERIES)), axis=0) for _ in range(4)]
     fit = fit_people(tracks, list("abcd"))
-    index = 2  # the first that adapts
+    index = 3  # the first that adapts
     linear = [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
     expert, part = linear[index], fit.linear[index]
     number = EXPERTS.index(expert)
@@ -209,7 +225,7 @@ def test_learning_is_weighted_ridge_regression() -> None:
     rows, made, expected, error = [], [], [], []
     for frame in path:
         state.take(frame[None])
-        expected.append(state.expected_errors()[1][0])
+        expected.append(state.mixture.expected_errors()[1][0])
         forecast = state.forecast()
         state.remember(forecast)
         rows.append(forecast.features[index][0])
@@ -236,6 +252,57 @@ def test_learning_is_weighted_ridge_regression() -> None:
             change = np.linalg.solve(gram, cross)
             oracle = rows[last] @ (part.people[place] + change)
             np.testing.assert_allclose(error[last, place], oracle, rtol=1e-6, atol=1e-9)
+
+
+def test_what_was_learnt_counts_little_at_rest(predictor: ResidualPredictor) -> None:
+    people = predictor.fit.people
+    mixture = Mixture(replace(people, usual=np.zeros_like(people.usual)), 2)
+    adapts = np.array([isinstance(e, LinearExpert) and e.adapts for e in EXPERTS], dtype=float)
+    experts = np.tile(adapts[None, :, None, None], (2, 1, len(HORIZONS), SERIES))
+    steps = np.array([0.02, 3.0])[:, None, None] * CALM
+    recent = steps * np.arange(9)[:, None] * np.ones(SERIES)
+    for step in steps[:, 0, 0] * np.ones((70, 1)):
+        mixture.take(step)
+    moved, _ = mixture.mix(experts, recent)
+    assert np.all(moved[0] < 0.01)  # the share of the experts that adapt
+    np.testing.assert_allclose(moved[1], adapts.mean())
+    for _ in range(3000):
+        mixture.take(steps[:, 0, 0])
+    assert np.all(mixture.mix(experts, recent)[0][0] > 0.1)  # proven by now
+
+
+def test_mixing_again_is_what_following_does(predictor: ResidualPredictor) -> None:
+    faces = swaying(2, 60, seed=4)
+    tracks = [
+        face_series(face, predictor.fit.basis)[:length] / float(face_side(face[0]))
+        for face, length in zip(faces, (45, 60), strict=True)
+    ]
+    tried = trial(predictor.fit, tracks)
+    signs, errors = mix_again(predictor.fit.people, [made for made, _ in tried], tracks)
+    expected = [missed(mixed, track) for (_, mixed), track in zip(tried, tracks, strict=True)]
+    np.testing.assert_allclose(errors, np.concatenate(expected), rtol=1e-9, atol=1e-12)
+    assert np.all(np.isfinite(signs))
+
+
+def test_the_iterated_expert_forecasts_frame_by_frame() -> None:
+    rng = np.random.default_rng(5)
+    steps = rng.normal(0, 0.01, (400, SERIES))
+    for frame in range(1, 400):
+        steps[frame] += 0.6 * steps[frame - 1]
+    rows = Rows.of([np.cumsum(steps, axis=0)] * 2, ["ann", "bob"])
+    expert = LinearExpert(4, 2, 0, adapts=False, iterated=True)
+    fit = fit_linear(expert, rows, np.array(HORIZONS))
+    assert fit.precision is None
+    once = fit_linear(expert, rows, np.array([1])).people[0] / fit.scale[:, None]  # (F, D)
+    past = steps[-2:, 2:6].copy()
+    moved = []
+    for _ in range(HORIZONS[-1]):
+        step = past.reshape(-1) @ once
+        past = np.stack([past[1], step[2:6]])
+        moved.append(step)
+    expected = np.cumsum(moved, axis=0)[np.array(HORIZONS) - 1]
+    found = steps[-2:, 2:6].reshape(-1) / fit.scale @ fit.people
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_slow_means_begin_as_the_mean() -> None:

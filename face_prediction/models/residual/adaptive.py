@@ -55,10 +55,25 @@ class Band:
 
 BANDS = (Band(slice(0, 5), 2), Band(slice(5, 9), 6))
 """Up to 5 frames ahead as at 3, beyond as at 12."""
-SHARPNESS = 15.0
+SHARPNESS = 20.0
 """An expert whose error is 1 + d times the best one's has exp(-SHARPNESS d) times its weight."""
-MIX_MEMORY = 40.0
+WEIGHT_MEMORY = 100.0
 """Frames after which an error counts 1 / e in an expert's weight."""
+SIZE_MEMORY = 40.0
+"""Frames after which an error of the mixture counts 1 / e in the error that is expected of it."""
+CALM = 2e-3
+"""Face sides a frame: the motion of a mouth that is slower is mostly the detector's jitter."""
+MOST_CALM = 2.5
+"""Logarithm of the speed below `CALM`, at most, that caution grows with."""
+CAUTION = 0.8
+"""Logarithm by which the error of an expert that adapts is assumed larger for each e-fold that the
+mouth is slower than `CALM`: coefficients learnt from a moving face are worth little once it comes
+to rest."""
+FAR_CAUTION = 0.4
+"""The same, beyond the first band of horizons, for the others but the iterated one, which is the
+best baseline: it is what the mixture falls back to."""
+PROVEN = 70.0
+"""Frames after which caution falls as 1 / frames."""
 PRIOR_ROWS = 20.0
 """Frames that the training people's errors count as, beside those of the watched face."""
 PACE_MEMORY = 60.0
@@ -134,8 +149,8 @@ class StateForecast:
     features: tuple[Floats, ...]
 
 
-class FaceState:
-    """State of N faces that are followed from frame to frame.
+class Mixture:
+    """Weights of the experts on N faces, by their errors so far.
 
     Args:
         fit: of the training people.
@@ -145,27 +160,21 @@ class FaceState:
     def __init__(self, fit: PeopleFit, faces: int) -> None:
         self.fit, self.frames = fit, 0
         knots, top = len(fit.horizons), int(fit.horizons[-1])
-        self._recent = np.zeros((faces, max(RECENT, top + 1), SERIES))
-        self._slow = np.zeros((faces, len(SLOW), SERIES))
+        self._cautions = cautions(fit.horizons)
         self._steps = np.zeros(faces)
         self._errors = np.zeros((faces, len(EXPERTS), knots))
         self._mixed_errors = np.zeros((faces, knots))
         self._late_errors = np.zeros((faces, knots))
-        self._count, self._late_count = np.zeros(knots), np.zeros(knots)
-        self._moved = Ring(top, (faces, knots, SERIES))
+        self._count, self._mixed_count, self._late_count = (np.zeros(knots) for _ in range(3))
+        self._moved = Ring(top, (faces, knots, 2))
         self._experts = Ring(top, (faces, len(EXPERTS), knots, 2))
-        self._bands = [band for band in BANDS if band.knots.start < knots]
-        self._learners = [
-            _Learner(expert, part, faces, self._bands, fit.horizons)
-            for expert, part in zip(_linear_experts(), fit.linear, strict=True)
-        ]
 
     def keep(self, faces: int) -> None:
         """Go on with the first so many faces."""
-        for name in ("_recent", "_slow", "_steps", "_errors", "_mixed_errors", "_late_errors"):
+        for name in ("_steps", "_errors", "_mixed_errors", "_late_errors"):
             setattr(self, name, getattr(self, name)[:faces])
-        for part in (self._moved, self._experts, *self._learners):
-            part.keep(faces)
+        self._moved.keep(faces)
+        self._experts.keep(faces)
 
     @property
     def pace(self) -> Floats:
@@ -175,11 +184,107 @@ class FaceState:
         mean = (self._steps + PRIOR_ROWS * self.fit.pace) / (seen + PRIOR_ROWS)
         return np.maximum(mean, LEAST_PACE)
 
+    def known(self) -> NDArray[np.int64]:
+        """Horizons (K,) whose forecast was made from a frame that was seen."""
+        horizons = self.fit.horizons
+        return horizons[: int(np.searchsorted(horizons, self.frames - 1, side="right"))]
+
     def expected_errors(self) -> tuple[Floats, Floats]:
         """Mean errors so far of the experts (N, E, H) and of the mixture (N, H)."""
-        seen = self._count + PRIOR_ROWS
         usual = PRIOR_ROWS * self.fit.usual_errors(self.pace)
-        return (self._errors + usual[:, :-1]) / seen, (self._mixed_errors + usual[:, -1]) / seen
+        experts = (self._errors + usual[:, :-1]) / (self._count + PRIOR_ROWS)
+        return experts, (self._mixed_errors + usual[:, -1]) / (self._mixed_count + PRIOR_ROWS)
+
+    def take(self, step: Floats) -> None:
+        """Take in the next frame, in which the mouth moved by ``step`` (N,) on average."""
+        self._steps = self._steps * np.exp(-1 / PACE_MEMORY) + step
+        self.frames += 1
+
+    def outcomes(self) -> Floats:
+        """Forecasts (N, K, 2) of the mouth that the newest frame decides."""
+        return self._moved.of_horizons(self.known())
+
+    def learn(self, truth: Floats) -> Floats:
+        """Learn from the mouth's displacements (N, K, 2) up to the newest frame.
+
+        Returns:
+            Errors (N, K, E) of the experts.
+        """
+        ages = self.known()
+        known = slice(len(ages))
+        made = self._experts.of_horizons(ages, axis=1).swapaxes(1, 2)  # (N, K, E, 2)
+        errors = np.abs(made - truth[:, :, None]).mean(axis=-1)
+        mixed = np.abs(self.outcomes() - truth).mean(axis=-1)
+        for name, count, memory, error in (
+            ("_errors", "_count", WEIGHT_MEMORY, errors.swapaxes(1, 2)),
+            ("_mixed_errors", "_mixed_count", SIZE_MEMORY, mixed),
+            ("_late_errors", "_late_count", LATE_MEMORY, mixed),
+        ):
+            for sums, more in ((getattr(self, name), error), (getattr(self, count), 1)):
+                sums[..., known] = np.exp(-1 / memory) * sums[..., known] + more
+        return errors
+
+    def mix(self, experts: Floats, recent: Floats) -> tuple[Floats, Floats]:
+        """Mix the experts' forecasts.
+
+        Args:
+            experts: (N, E, H, D) displacements.
+            recent: (N, W, D) frames that they were made from.
+
+        Returns:
+            Displacements (N, H, D), and signs (N, H, S) of the size of their error.
+        """
+        errors, expected = self.expected_errors()
+        speed = np.abs(np.diff(recent[:, -4:, :2], axis=1)).mean(axis=(1, 2)) + LEAST_PACE / 4
+        cautious = errors * self._caution(speed)
+        share = np.exp(-SHARPNESS * (cautious / cautious.min(axis=1, keepdims=True) - 1))
+        share /= share.sum(axis=1, keepdims=True)  # (N, E, H)
+        moved = np.einsum("neh,nehd->nhd", share, experts)
+        apart = np.abs(experts[..., :2] - moved[:, None, :, :2]).mean(axis=-1)
+        late = (self._late_errors + 3 * expected) / (self._late_count + 3)
+        signs = [
+            expected,
+            late + LEAST_PACE / 4,
+            np.broadcast_to(speed[:, None], expected.shape),
+            (share * apart).sum(axis=1) + LEAST_PACE / 4,
+        ]
+        return moved, np.log(np.stack(signs, axis=-1))
+
+    def remember(self, moved: Floats, experts: Floats) -> None:
+        """Keep forecasts (N, H, D) and (N, E, H, D), to learn from their outcome."""
+        self._moved.push(moved[..., :2])
+        self._experts.push(experts[..., :2])
+
+    def _caution(self, speed: Floats) -> Floats:
+        """Factors (N, E, H) on the errors of the experts at a speed (N,) of the mouth."""
+        calm = np.clip(np.log(CALM / speed), 0, MOST_CALM) * min(1.0, PROVEN / self.frames)
+        return np.exp(calm[:, None, None] * self._cautions)
+
+
+class FaceState:
+    """State of N faces that are followed from frame to frame.
+
+    Args:
+        fit: of the training people.
+        faces: N.
+    """
+
+    def __init__(self, fit: PeopleFit, faces: int) -> None:
+        self.fit, self.mixture = fit, Mixture(fit, faces)
+        top = int(fit.horizons[-1])
+        self._recent = np.zeros((faces, max(RECENT, top + 1), SERIES))
+        self._slow = np.zeros((faces, len(SLOW), SERIES))
+        bands = [band for band in BANDS if band.knots.start < len(fit.horizons)]
+        self._learners = [
+            _Learner(expert, part, faces, bands, fit.horizons)
+            for expert, part in zip(_linear_experts(), fit.linear, strict=True)
+        ]
+
+    def keep(self, faces: int) -> None:
+        """Go on with the first so many faces."""
+        self._recent, self._slow = self._recent[:faces], self._slow[:faces]
+        for part in (self.mixture, *self._learners):
+            part.keep(faces)
 
     def recent(self, count: int) -> Floats:
         """The last frames (N, count, D) taken in; before the first one the face was at rest."""
@@ -187,21 +292,27 @@ class FaceState:
 
     def take(self, series: Floats) -> None:
         """Take in the next frame (N, D), and learn from the forecasts that it decides."""
-        if self.frames:
-            step = np.abs(series[:, :2] - self._recent[:, -1, :2]).mean(axis=1)
-            self._steps = self._steps * np.exp(-1 / PACE_MEMORY) + step
+        frames = self.mixture.frames
+        if frames:
             self._recent = _pushed(self._recent, series)
-            self._slow += slow_rates(self.frames)[:, None] * (series[:, None] - self._slow)
+            self._slow += slow_rates(frames)[:, None] * (series[:, None] - self._slow)
         else:
             self._recent[:], self._slow[:] = series[:, None], series[:, None]
-        self.frames += 1
-        self._learn()
+        self.mixture.take(np.abs(np.diff(self._recent[:, -2:, :2], axis=1)).mean(axis=(1, 2)))
+        ages = self.mixture.known()
+        if not len(ages):
+            return
+        truth = self._recent[:, -1:] - self._recent[:, -1 - ages]
+        errors = self.mixture.learn(truth[..., :2])
+        expected = self.mixture.expected_errors()[1]
+        numbers = [n for n, expert in enumerate(EXPERTS) if isinstance(expert, LinearExpert)]
+        for number, learner in zip(numbers, self._learners, strict=True):
+            learner.learn(errors[..., number], expected, truth, ages)
 
     def forecast(self, recent: Floats | None = None) -> StateForecast:
         """Forecast from the newest frame, or from other ``recent`` frames (N, W, D)."""
         recent = self._recent[:, -RECENT:] if recent is None else recent
-        shape = (len(recent), len(EXPERTS), len(self.fit.horizons), SERIES)
-        experts = np.empty(shape)
+        experts = np.empty((len(recent), len(EXPERTS), len(self.fit.horizons), SERIES))
         features: list[Floats] = []
         learners = iter(self._learners)
         for number, expert in enumerate(EXPERTS):
@@ -211,64 +322,20 @@ class FaceState:
                 experts[:, number] = learner.forecast(features[-1])
             else:
                 experts[:, number] = extrapolate(expert, recent, self.fit.horizons)
-        errors, expected = self.expected_errors()
-        share = np.exp(-SHARPNESS * (errors / errors.min(axis=1, keepdims=True) - 1))
-        share /= share.sum(axis=1, keepdims=True)  # (N, E, H)
-        moved = np.einsum("neh,nehd->nhd", share, experts)
-        apart = np.abs(experts[..., :2] - moved[:, None, :, :2]).mean(axis=-1)
-        late = (self._late_errors + 3 * expected) / (self._late_count + 3)
-        speed = np.abs(np.diff(recent[:, -4:, :2], axis=1)).mean(axis=(1, 2)) + LEAST_PACE / 4
-        signs = np.log(
-            np.stack(
-                [
-                    expected,
-                    late + LEAST_PACE / 4,
-                    np.broadcast_to(speed[:, None], expected.shape),
-                    (share * apart).sum(axis=1) + LEAST_PACE / 4,
-                ],
-                axis=-1,
-            )
-        )
+        moved, signs = self.mixture.mix(experts, recent)
         return StateForecast(moved, signs, experts, tuple(features))
 
     def remember(self, made: StateForecast) -> None:
         """Keep the forecast from the frame taken in last, to learn from its outcome."""
-        self._moved.push(made.moved)
-        self._experts.push(made.experts[..., :2])
+        self.mixture.remember(made.moved, made.experts)
         for learner, features in zip(self._learners, made.features, strict=True):
             learner.remember(features)
 
     def outcomes(self) -> tuple[Floats, Floats]:
-        """Forecasts and truth (N, K, D) that the newest frame decided, of the K horizons known."""
-        ages = self.known()
-        truth = self._recent[:, -1:] - self._recent[:, -1 - ages]
-        return self._moved.of_horizons(ages), truth
-
-    def known(self) -> NDArray[np.int64]:
-        """Horizons (K,) whose forecast was made from a frame that was seen."""
-        horizons = self.fit.horizons
-        return horizons[: int(np.searchsorted(horizons, self.frames - 1, side="right"))]
-
-    def _learn(self) -> None:
-        """Learn from what the newest frame decided, of forecasts that have been remembered."""
-        ages = self.known()
-        if not len(ages):
-            return
-        moved, truth = self.outcomes()
-        known = slice(len(ages))
-        made = self._experts.of_horizons(ages, axis=1).swapaxes(1, 2)  # (N, K, E, 2)
-        errors = np.abs(made - truth[:, :, None, :2]).mean(axis=-1)
-        mixed = np.abs(moved - truth)[..., :2].mean(axis=-1)
-        memory, late = np.exp(-1 / MIX_MEMORY), np.exp(-1 / LATE_MEMORY)
-        self._errors[:, :, known] = memory * self._errors[:, :, known] + errors.swapaxes(1, 2)
-        self._mixed_errors[:, known] = memory * self._mixed_errors[:, known] + mixed
-        self._late_errors[:, known] = late * self._late_errors[:, known] + mixed
-        self._count[known] = memory * self._count[known] + 1
-        self._late_count[known] = late * self._late_count[known] + 1
-        expected = self.expected_errors()[1]
-        numbers = [n for n, expert in enumerate(EXPERTS) if isinstance(expert, LinearExpert)]
-        for number, learner in zip(numbers, self._learners, strict=True):
-            learner.learn(errors[..., number], expected, truth, ages)
+        """Forecasts of the mouth and truth (N, K, 2) that the newest frame decided."""
+        ages = self.mixture.known()
+        truth = self._recent[:, -1:, :2] - self._recent[:, -1 - ages, :2]
+        return self.mixture.outcomes(), truth
 
 
 class Ring:
@@ -421,6 +488,18 @@ def row_weights(ratio: Floats, usual: Floats, horizon: int) -> Floats:
 
 def _linear_experts() -> list[LinearExpert]:
     return [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
+
+
+def cautions(horizons: NDArray[np.int64]) -> Floats:
+    """Caution (E, H) about each expert at each horizon."""
+    far = horizons > HORIZONS[BANDS[0].knots.stop - 1]
+    result = np.empty((len(EXPERTS), len(horizons)))
+    for number, expert in enumerate(EXPERTS):
+        if isinstance(expert, LinearExpert) and (expert.adapts or expert.iterated):
+            result[number] = CAUTION if expert.adapts else 0.0
+        else:
+            result[number] = np.where(far, FAR_CAUTION, 0.0)
+    return result
 
 
 def _pushed(past: Floats, newest: Floats) -> Floats:

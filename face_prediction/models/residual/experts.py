@@ -40,14 +40,17 @@ class LinearExpert:
         memory: frames after which what it has learnt counts 1 / e.
         calm: whether people who hardly move count as much as the others in its coefficients, of
             which the sum of all errors takes no notice.
+        iterated: whether it forecasts one frame, and from that the next, as the baseline
+            `ar_landmarks` does; it does not adapt and sees no places.
     """
 
     shapes: int
     lags: int
     places: int
     adapts: bool = True
-    memory: float = 100.0
+    memory: float = 200.0
     calm: bool = False
+    iterated: bool = False
 
     @property
     def columns(self) -> list[int]:
@@ -80,6 +83,7 @@ Expert = LinearExpert | Extrapolation
 EXPERTS: tuple[Expert, ...] = (
     LinearExpert(4, 2, 0, adapts=False),
     LinearExpert(4, 3, 0, adapts=False, calm=True),
+    LinearExpert(4, 1, 0, adapts=False, iterated=True),
     LinearExpert(8, 3, 3),
     LinearExpert(4, 6, 3),
     LinearExpert(0, 4, 3),

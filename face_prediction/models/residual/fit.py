@@ -23,6 +23,7 @@ from face_prediction.models.residual.adaptive import (
     LEAST_PACE,
     MOST_PACE,
     LinearFit,
+    Mixture,
     PeopleFit,
     row_weights,
 )
@@ -56,6 +57,7 @@ _STILL = 1e-3  # face sides: a track with this mean step of the mouth counts hal
 _STRIDE = 2  # frames between rows that are fitted to: neighbours are alike
 _WARM_UP = 10  # frames at the beginning of a track that are left out: they have no past
 _EM_ROUNDS = 10
+_MOST_ROOT = 0.99  # modulus of an iterated expert's eigenvalues, as of the baseline's
 _FIRST_SPREAD = 0.05  # of coefficients of scaled features, where the maximisation begins
 _LEAST_SPREAD = 1e-3  # share of the mean variance added to every one
 _MEASURED = 500  # frames at the beginning of a track that errors are measured on
@@ -129,6 +131,8 @@ def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) ->
     people = np.empty((count, size, rows.series.shape[1]))
     usual = [band.usual for band in BANDS]
     precision = np.empty((len(BANDS), size, size))
+    if expert.iterated:
+        return LinearFit(scale, iterated(expert, features, scale, rows, horizons), None)
     for place, horizon in enumerate(horizons.tolist()):
         origins = rows.origins(horizon)
         x = features[origins]
@@ -137,11 +141,41 @@ def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) ->
         weight = 1 / pace if expert.calm else pace / (pace + _STILL)
         people[place] = least_absolute(x, y, weight, _SMALL_ERROR / (10 if expert.calm else 1))
         if expert.adapts and place in usual:
-            missed = (y - x @ people[place])[:, :2]
+            rest = (y - x @ people[place])[:, :2]
             precision[usual.index(place)] = spread(
-                x, missed, rows.person[origins], horizon, expert.memory
+                x, rest, rows.person[origins], horizon, expert.memory
             )
     return LinearFit(scale, people, precision if expert.adapts else None)
+
+
+def iterated(
+    expert: LinearExpert, features: Floats, scale: Floats, rows: Rows, horizons: NDArray[np.int64]
+) -> Floats:
+    """Coefficients (H, F, D) of an autoregression that is iterated.
+
+    Args:
+        expert: whose features they are.
+        features: (N, F) divided by their scale.
+        scale: (F,).
+        rows: of all tracks.
+        horizons: (H,).
+    """
+    origins = rows.origins(1)
+    x = features[origins]
+    y = rows.series[origins + 1] - rows.series[origins]
+    step = np.linalg.lstsq(x, y, rcond=None)[0]  # (F, D)
+    kept = len(expert.columns)
+    onward = np.zeros((expert.size, expert.size))  # features of the next frame from these
+    onward[kept:, :-kept] = np.diag(scale[kept:] / scale[:-kept])
+    onward[:, -kept:] = step[:, expert.columns] / scale[-kept:]
+    largest = np.abs(np.linalg.eigvals(onward)).max()
+    if largest > _MOST_ROOT:  # its expectation would not converge
+        onward *= _MOST_ROOT / largest
+    moved, power = np.zeros((len(horizons), *step.shape)), np.eye(expert.size)
+    for horizon in range(1, int(horizons[-1]) + 1):
+        moved[horizons >= horizon] += power @ step
+        power = power @ onward
+    return moved
 
 
 def least_absolute(x: Floats, y: Floats, weight: Floats, small: float) -> Floats:
@@ -214,84 +248,110 @@ def fit_residual(tracks: Sequence[NDArray[np.floating]], subjects: Sequence[str]
     blank = IntervalFit(
         np.zeros((len(HORIZONS), 2, SIGNS + 1)), np.zeros((len(HORIZONS), 2, len(LEVELS)))
     )
-    trials: list[Trial] = []
+    made: list[Floats] = [np.empty(0)] * len(series)
+    mixed: list[Floats] = [np.empty(0)] * len(series)
     for part in range(2):
         own, others = (np.flatnonzero((half == part) == same).tolist() for same in (True, False))
         fit = fit_people([series[i] for i in others], [subjects[i] for i in others])
         fit = replace(fit, usual=people.usual, pace=people.pace)
-        shown_part = [series[i][:_MEASURED] for i in own]
-        trials.append(trial(ResidualFit(basis, fit, blank), shown_part))
-    usual = usual_errors(trials, people.pace)
-    signs, errors = (np.concatenate([getattr(t, n) for t in trials]) for n in ("signs", "errors"))
-    return ResidualFit(basis, replace(people, usual=usual), measure_intervals(signs, errors))
+        tried = trial(ResidualFit(basis, fit, blank), [series[i][:_MEASURED] for i in own])
+        for number, (experts, mixture) in zip(own, tried, strict=True):
+            made[number], mixed[number] = experts, mixture
+    measured = [track[:_MEASURED] for track in series]
+    usual = usual_errors(made, mixed, measured, people.pace)
+    people = replace(people, usual=usual)
+    signs, errors = mix_again(people, made, measured)
+    return ResidualFit(basis, people, measure_intervals(signs, errors))
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Forecasts of people that the coefficients were not fitted to, N frames of all tracks.
+def trial(fit: ResidualFit, tracks: Sequence[Floats]) -> list[tuple[Floats, Floats]]:
+    """Forecast tracks (T, D) from every frame.
 
-    Attributes:
-        signs: (N, H, S), see `intervals`.
-        errors: (N, H, 2) of the mixture; NaN where the track had ended.
-        sizes: (N, E + 1, H) absolute errors of the experts and, last, of the mixture, both axes'
-            mean.
-        track: (N,) number of the track.
-        pace: (N,) mean step of the mouth in the track.
+    Returns:
+        Forecasts of the mouth of each track by the experts (T, E, H, 2) and the mixture (T, H, 2).
     """
-
-    signs: Floats
-    errors: Floats
-    sizes: Floats
-    track: NDArray[np.int64]
-    pace: Floats
-
-
-def trial(fit: ResidualFit, tracks: Sequence[Floats]) -> Trial:
-    """Forecast tracks (T, D) from every frame."""
-    knots = fit.people.horizons
-    signs = [np.full((len(track), len(knots), SIGNS), np.nan) for track in tracks]
-    count = len(EXPERTS) + 1
-    moved = [np.full((len(track), count, len(knots), 2), np.nan) for track in tracks]
+    shape = (len(EXPERTS), len(fit.people.horizons), 2)
+    made: list[tuple[Floats, Floats]] = [
+        (np.empty((len(t), *shape)), np.empty((len(t), *shape[1:]))) for t in tracks
+    ]
     for frame, numbers, _, forecast in follow_tracks(fit, tracks, HORIZONS[-1]):
         for place, number in enumerate(numbers):
-            signs[number][frame] = forecast.signs[place]
-            moved[number][frame, :-1] = forecast.experts[place, ..., :2]
-            moved[number][frame, -1] = forecast.moved[place, :, :2]
-    for track, made in zip(tracks, moved, strict=True):
-        for place, horizon in enumerate(knots.tolist()):
-            last = max(len(track) - horizon, 0)
-            made[:last, :, place] -= (track[horizon:, :2] - track[:last, :2])[:, None]
-            made[last:, :, place] = np.nan
-        made[:_WARM_UP] = np.nan
-    joined = np.concatenate(moved)
-    lengths = [len(track) for track in tracks]
-    paces = [max(float(np.abs(np.diff(t[:, :2], axis=0)).mean()), LEAST_PACE) for t in tracks]
-    return Trial(
-        np.concatenate(signs),
-        joined[:, -1],
-        np.abs(joined).mean(axis=-1),
-        np.repeat(np.arange(len(tracks)), lengths),
-        np.repeat(paces, lengths),
-    )
+            made[number][0][frame] = forecast.experts[place, ..., :2]
+            made[number][1][frame] = forecast.moved[place, :, :2]
+    return made
 
 
-def usual_errors(trials: Sequence[Trial], pace: float) -> Floats:
-    """`PeopleFit.usual`: the line through the mean errors of tracks, by their pace."""
-    shape = trials[0].sizes.shape[1:]
+def missed(made: Floats, track: Floats) -> Floats:
+    """Errors (T, ..., H, 2) of forecasts of the mouth; NaN where the track (T, D) had ended.
+
+    NaN too while it had no past.
+    """
+    errors = np.full(made.shape, np.nan)
+    for place, horizon in enumerate(HORIZONS):
+        last = len(track) - horizon
+        if last > _WARM_UP:
+            own = slice(_WARM_UP, last)
+            truth = track[_WARM_UP + horizon :, :2] - track[own, :2]
+            truth = truth.reshape(len(truth), *[1] * (made.ndim - 3), 2)
+            errors[own, ..., place, :] = made[own, ..., place, :] - truth
+    return errors
+
+
+def usual_errors(
+    made: Sequence[Floats], mixed: Sequence[Floats], tracks: Sequence[Floats], pace: float
+) -> Floats:
+    """`PeopleFit.usual`: the line through the mean errors of tracks (T, D), by their pace.
+
+    Args:
+        made: forecasts (T, E, H, 2) by the experts.
+        mixed: by the mixture (T, H, 2).
+        tracks: (T, D).
+        pace: the median one.
+    """
     relative: list[Floats] = []
     paces: list[float] = []
-    for made in trials:
-        for number in np.unique(made.track):
-            own = made.track == number
-            sizes = made.sizes[own]
-            if np.isfinite(sizes).any(axis=0).all():
-                own_pace = float(made.pace[own][0])
-                paces.append(own_pace)
-                relative.append(np.log(np.nanmean(sizes, axis=0) / own_pace + 1e-9))
+    for experts, mixture, track in zip(made, mixed, tracks, strict=True):
+        errors = missed(np.concatenate([experts, mixture[:, None]], axis=1), track)
+        sizes = np.abs(errors).mean(axis=-1)  # (T, E + 1, H)
+        if np.isfinite(sizes).any(axis=0).all():
+            paces.append(max(float(np.abs(np.diff(track[:, :2], axis=0)).mean()), LEAST_PACE))
+            relative.append(np.log(np.nanmean(sizes, axis=0) / paces[-1] + 1e-9))
     ratio = np.log(np.clip(np.array(paces) / pace, 1 / MOST_PACE, MOST_PACE))
     rows = np.stack([np.ones_like(ratio), ratio], axis=1)
     solution = np.linalg.lstsq(rows, np.array(relative).reshape(len(ratio), -1), rcond=None)[0]
-    return solution.T.reshape(*shape, 2)
+    return solution.T.reshape(len(EXPERTS) + 1, len(HORIZONS), 2)
+
+
+def mix_again(
+    people: PeopleFit, made: Sequence[Floats], tracks: Sequence[Floats]
+) -> tuple[Floats, Floats]:
+    """Mix the experts' forecasts (T, E, H, 2) of tracks (T, D) with other usual errors.
+
+    Returns:
+        Signs (N, H, S), see `intervals`, and errors (N, H, 2) of the mixture in all frames, NaN
+        where there is none.
+    """
+    order = sorted(range(len(tracks)), key=lambda number: -len(tracks[number]))
+    recent = [recent_frames(track[:, :2]) for track in tracks]
+    signs = [np.empty((len(track), len(HORIZONS), SIGNS)) for track in tracks]
+    moved = [np.empty((len(track), len(HORIZONS), 2)) for track in tracks]
+    mixture = Mixture(people, len(order))
+    for frame in range(len(tracks[order[0]])):
+        alive = [number for number in order if len(tracks[number]) > frame]
+        mixture.keep(len(alive))
+        seen = np.stack([recent[number][frame] for number in alive])
+        mixture.take(np.abs(seen[:, -1] - seen[:, -2]).mean(axis=1))
+        ages = mixture.known()
+        if len(ages):
+            mouth = [tracks[number][:, :2] for number in alive]
+            mixture.learn(np.stack([track[frame] - track[frame - ages] for track in mouth]))
+        experts = np.stack([made[number][frame] for number in alive])
+        forecast, told = mixture.mix(experts, seen)
+        mixture.remember(forecast, experts)
+        for place, number in enumerate(alive):
+            moved[number][frame], signs[number][frame] = forecast[place], told[place]
+    errors = [missed(own, track) for own, track in zip(moved, tracks, strict=True)]
+    return np.concatenate(signs), np.concatenate(errors)
 
 
 def shapes_of(tracks: Sequence[NDArray[np.floating]]) -> Floats:

@@ -172,10 +172,10 @@ class FollowedFaces:
     def take(self, series: Floats) -> StateForecast:
         """Take in the next frame (B, D) in face sides; return the forecast from it."""
         self._state.take(series)
-        ages = self._state.known()
+        ages = self._state.mixture.known()
         if len(ages):
             made, truth = self._state.outcomes()
-            self._intervals.learn((made - truth)[..., :2], ages)
+            self._intervals.learn(made - truth, ages)
         forecast = self._state.forecast()
         self._state.remember(forecast)
         self._intervals.remember(forecast.signs)

@@ -1,0 +1,201 @@
+"""Worth of each part of residual prediction: the error without it, on people never fitted to.
+
+Every person is forecast by the fit of their fold, whole and with one part taken out: an expert, or
+what weights experts and rows. Fits are not repeated: the rest makes up for a part only as far as
+the mixture does. Without an expert, or with other weights, the forecasts of the whole are mixed
+again. Errors are means of abs dU and dV after the first 69 frames of a track, as in
+``face-prediction evaluate``; intervals are over people. Every line of ``--out`` is one part on one
+fold: a run that was interrupted goes on where it stopped::
+
+    face-prediction fit --dataset face_dataset --test_fold 0 --out checkpoints/residual_fold0
+    python benchmarks/forecast_ablation.py --dataset face_dataset \
+        --checkpoints checkpoints/residual_fold* --out ablation.jsonl
+
+prints a Markdown table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from face_prediction.dataset.reader import FaceDataset
+from face_prediction.dataset.sequences import SequenceSettings
+from face_prediction.dataset.tracks import FaceStretch, dataset_stretches
+from face_prediction.evaluation.tracks import GROUPS, person_resamples
+from face_prediction.models.loading import load_predictor
+from face_prediction.models.residual import adaptive
+from face_prediction.models.residual.adaptive import HORIZONS
+from face_prediction.models.residual.experts import EXPERTS
+from face_prediction.models.residual.fit import missed, mix_again, trial
+from face_prediction.models.residual.predictor import (
+    ResidualFit,
+    ResidualPredictor,
+    face_series,
+    face_side,
+)
+
+WHOLE = "nothing"
+MIXING: dict[str, dict[str, float]] = {
+    "weights by errors (all experts alike)": {"SHARPNESS": 0.0},
+    "caution at rest": {"CAUTION": 0.0, "FAR_CAUTION": 0.0},
+    "long memory of weights (40 frames)": {"WEIGHT_MEMORY": 40.0},
+}
+"""Parts of the mixture that a constant of `adaptive` switches off, and its value then."""
+ROWS: dict[str, dict[str, float]] = {
+    "rows of overlapping errors count less": {"OVERLAP": 0.0},
+}
+"""The same, of what a face teaches."""
+LEARNING = "learning from the face"
+SHRINKAGE = "covariance between people (plain ridge)"
+_NEVER = 60.0  # logarithm of an expert's error that leaves it without weight
+
+
+def mixing_variants() -> dict[str, int | None]:
+    """Parts that need no other forecasts of the experts; for an expert its number."""
+    experts = {f"`{expert!r}`": number for number, expert in enumerate(EXPERTS)}
+    return dict.fromkeys(MIXING) | experts
+
+
+def variants() -> list[str]:
+    """All parts, in the order of the table."""
+    return [WHOLE, LEARNING, SHRINKAGE, *ROWS, *mixing_variants()]
+
+
+@contextmanager
+def without(name: str, fit: ResidualFit) -> Iterator[ResidualFit]:
+    """Yield the fit without a part of `variants`."""
+    people, number = fit.people, mixing_variants().get(name)
+    if number is not None:
+        usual = people.usual.copy()
+        usual[number, :, 0] = _NEVER
+        people = replace(people, usual=usual)
+    changed = []
+    for part in people.linear:
+        precision = part.precision
+        if precision is not None and name == LEARNING:
+            precision = 1e12 * precision
+        elif precision is not None and name == SHRINKAGE:
+            size = precision.shape[-1]
+            mean = np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / size
+            precision = np.eye(size) / mean[:, None, None]
+        changed.append(replace(part, precision=precision))
+    constants = {**MIXING, **ROWS}.get(name, {})
+    before = {key: getattr(adaptive, key) for key in constants}
+    for key, value in constants.items():
+        setattr(adaptive, key, value)
+    try:
+        yield replace(fit, people=replace(people, linear=tuple(changed)))
+    finally:
+        for key, value in before.items():
+            setattr(adaptive, key, value)
+
+
+def sums(stretch: FaceStretch, errors: np.ndarray, settings: SequenceSettings) -> dict[str, object]:
+    """Sums and counts by group of frames ahead of errors (T, H, 2) in face sides, in crops."""
+    crops = stretch.crop_sides(settings) / face_side(stretch.landmarks[0])
+    size = (np.abs(errors).mean(axis=-1) / crops[:, None])[settings.history - 1 :]
+    knots = np.array(HORIZONS)
+    parts = [size[:, (knots >= first) & (knots <= last)] for first, last in GROUPS.values()]
+    return {
+        "subject": stretch.subject,
+        "kind": stretch.kind,
+        "sums": [float(np.nansum(part)) for part in parts],
+        "counts": [int(np.isfinite(part).sum()) for part in parts],
+    }
+
+
+def score(
+    fit: ResidualFit, stretches: list[FaceStretch], settings: SequenceSettings, names: list[str]
+) -> Iterator[tuple[str, list[dict[str, object]]]]:
+    """Yield each part's name, and the sums of every track without it."""
+    shown = [stretch.landmarks / face_side(stretch.landmarks[0]) for stretch in stretches]
+    series = [face_series(track, fit.basis) for track in shown]
+    cuts = np.cumsum([len(track) for track in series])[:-1]
+    mixing = [name for name in names if name in mixing_variants()]
+    for name in [name for name in variants() if name in names or (name == WHOLE and mixing)]:
+        if name in mixing:
+            continue
+        with without(name, fit) as changed:
+            tried = trial(changed, series)
+        errors = [missed(made, track) for (_, made), track in zip(tried, series, strict=True)]
+        if name in names:
+            yield name, [sums(*pair, settings) for pair in zip(stretches, errors, strict=True)]
+        if name != WHOLE:
+            continue
+        for other in mixing:
+            with without(other, fit) as changed:
+                again = mix_again(changed.people, [made for made, _ in tried], series)[1]
+            pairs = zip(stretches, np.split(again, cuts), strict=True)
+            yield other, [sums(*pair, settings) for pair in pairs]
+
+
+def table(lines: list[dict], resamples: int) -> str:
+    """Markdown: percent by which the error grows without each part, with 95 % over people."""
+    found: dict = defaultdict(lambda: defaultdict(lambda: np.zeros(len(GROUPS))))
+    for line in lines:
+        for track in line["tracks"]:
+            found[track["kind"]][line["without"], track["subject"]] += np.array(track["sums"])
+    shown = [name for name in variants() if any(line["without"] == name for line in lines)]
+    text = ["| kind | without | " + " | ".join(GROUPS) + " |", "|---" * (2 + len(GROUPS)) + "|"]
+    for kind, by in found.items():
+        subjects = sorted({subject for _, subject in by})
+        drawn = person_resamples(len(subjects), resamples, 0)
+        weights = np.concatenate([np.ones((1, len(subjects))), drawn])
+        whole = weights @ np.array([by[WHOLE, subject] for subject in subjects])
+        for name in shown[1:]:
+            ours = weights @ np.array([by[name, subject] for subject in subjects])
+            percent = 100 * (ours / np.maximum(whole, 1e-300) - 1)
+            low, high = np.quantile(percent[1:], (0.025, 0.975), axis=0)
+            cells = [
+                "–"
+                if not whole[0, g]
+                else f"{percent[0, g]:+.1f} ({low[g]:+.1f} to {high[g]:+.1f})"
+                for g in range(len(GROUPS))
+            ]
+            text.append(f"| {kind} | {name} | " + " | ".join(cells) + " |")
+    return "\n".join(text)
+
+
+def main() -> None:
+    """Score what is not yet in the file, and print the table."""
+    parser = argparse.ArgumentParser(description="Error of residual prediction without each part.")
+    parser.add_argument("--dataset", type=Path, default=Path("face_dataset"))
+    parser.add_argument("--checkpoints", type=Path, nargs="+", required=True, help="one a fold")
+    parser.add_argument("--most_frames", type=int, default=400, help="of each track, the first")
+    parser.add_argument("--out", type=Path, default=Path("forecast_ablation.jsonl"))
+    parser.add_argument("--resamples", type=int, default=1000)
+    options = parser.parse_args()
+    lines = []
+    if options.out.exists():
+        lines = [json.loads(line) for line in options.out.read_text().splitlines()]
+    done = {(line["without"], line["fold"], line["most_frames"]) for line in lines}
+    with FaceDataset(options.dataset) as dataset:
+        settings, stretches = dataset.manifest.settings, dataset_stretches(dataset)
+    with options.out.open("a") as out:
+        for folder in options.checkpoints:
+            predictor, record = load_predictor(folder)
+            fold = record.folds["test"][0]
+            names = [n for n in variants() if (n, fold, options.most_frames) not in done]
+            assert isinstance(predictor, ResidualPredictor)
+            own = [
+                replace(stretch, landmarks=stretch.landmarks[: options.most_frames])
+                for stretch in stretches
+                if stretch.fold == fold
+            ]
+            for name, tracks in score(predictor.fit, own, settings, names):
+                head = {"without": name, "fold": fold, "most_frames": options.most_frames}
+                lines.append({**head, "tracks": tracks})
+                print(json.dumps(lines[-1]), file=out, flush=True)
+    print(table([x for x in lines if x["most_frames"] == options.most_frames], options.resamples))
+
+
+if __name__ == "__main__":
+    main()
