@@ -455,7 +455,8 @@ def main() -> None:
         print((options.out / TIMES).read_text("utf-8"))
         return
     for seed in options.seeds:
-        for split in (name for name in SPLITS if name in options.splits):
+        splits: list[SplitName] = [name for name in SPLITS if name in options.splits]
+        for split in splits:
             for approach in options.approaches:
                 training = Training(approach, split, seed, *choose(options, approach, split))
                 evaluate(options, training, train(options, training))
