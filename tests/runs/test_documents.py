@@ -80,11 +80,23 @@ PLAIN = {"dict", "str", "cls", "kind", "part", "kinds", "type", "network", "tupl
 
 REPOSITORY = Path(__file__).parents[2]
 
-ANYTHING = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
-    max_leaves=5,
-)
+
+def anything(*, allow_nan: bool = True) -> st.SearchStrategy[Any]:
+    """Values that a document may hold anywhere."""
+    return st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers()
+        | st.floats(allow_nan=allow_nan)
+        | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+        max_leaves=5,
+    )
+
+
+ANYTHING = anything()
+COMPARABLE = anything(allow_nan=False)
+"""NaN is not equal to itself."""
 
 
 def plain(kind: Any) -> st.SearchStrategy[Any]:
@@ -122,7 +134,7 @@ def plain(kind: Any) -> st.SearchStrategy[Any]:
         type(None): st.none(),
         Path: st.just("some/path"),
     }
-    return simple.get(kind, ANYTHING)
+    return simple.get(kind, COMPARABLE)
 
 
 def _numbers(kind: Any, ends: Any) -> st.SearchStrategy[Any]:

@@ -16,7 +16,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from face_prediction.dataset.manifest import fold_split
 from face_prediction.models.settings import PredictorTrainSettings
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.trainer import CURVES, StepMeans, choose_people, torch_seed
@@ -140,15 +139,10 @@ class FakePeople:
 
     def __init__(self, folds: int = 4) -> None:
         self.folder = Path("fake")
-        self.manifest = SimpleNamespace(folds=folds)
         self.owner = [f"p{n % 7}" for n in range(14)]
-        self.fold = [(n % 7) % folds for n in range(14)]
-
-    def split(self, test: int):
-        return fold_split(self.manifest.folds, test)
-
-    def indices(self, folds) -> np.ndarray:
-        return np.array([n for n in range(14) if self.fold[n] in folds], dtype=np.int64)
+        clips = [SimpleNamespace(clip=f"c{n}", fold=n % 7 % folds, sequences=1) for n in range(14)]
+        settings = SimpleNamespace(length=75)
+        self.manifest = SimpleNamespace(folds=folds, clips=clips, settings=settings, seed=0)
 
     def entry(self, index: int):
         return SimpleNamespace(subject=self.owner[index])
