@@ -59,7 +59,7 @@ class FaceStretch:
 def without_windows(
     stretches: Iterable[FaceStretch], windows: Mapping[str, Iterable[tuple[int, int]]]
 ) -> list[FaceStretch]:
-    """What is left of stretches without the frames of ``windows`` (first frame, end), by clip."""
+    """Remainder of stretches without the frames of ``windows`` (first frame, end), by clip."""
     found: list[FaceStretch] = []
     for stretch in stretches:
         stop = stretch.start + len(stretch)
