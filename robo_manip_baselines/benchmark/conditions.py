@@ -26,6 +26,7 @@ from robo_manip_baselines.policy.checkpoint import read_checkpoint
 from robo_manip_baselines.policy.registry import policy_entry
 from robo_manip_baselines.runs.documents import convert, load_yaml, shortened
 from robo_manip_baselines.runs.errors import RequestError, require_choice, require_printable
+from robo_manip_baselines.runs.ranges import Count, Episodes, require_ranges
 
 CONDITIONS = Path(str(files("robo_manip_baselines.benchmark") / "conditions"))
 """Folder of the files that ship with the package; a benchmark is named after its file."""
@@ -237,6 +238,33 @@ EVERYBODY = DrawnPeople()
 
 
 @dataclass(frozen=True)
+class SizeChanges:
+    """Numbers of a preset that a benchmark has otherwise; None as in the preset.
+
+    Attributes:
+        demonstrations, train_seeds, num_episodes: see `BenchmarkPreset`.
+        train_settings: beside those of the preset.
+    """
+
+    demonstrations: Episodes | None = None
+    train_seeds: Count | None = None
+    num_episodes: Episodes | None = None
+    train_settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+    def given(self) -> dict[str, Any]:
+        """Return the numbers that differ, without the settings."""
+        numbers = {item.name: getattr(self, item.name) for item in fields(self)}
+        del numbers["train_settings"]
+        return {name: number for name, number in numbers.items() if number is not None}
+
+
+AS_IN_THE_PRESET = SizeChanges()
+
+
+@dataclass(frozen=True)
 class ConditionsDocument:
     """Content of a file of conditions.
 
@@ -244,6 +272,7 @@ class ConditionsDocument:
         conditions: entries, see `ConditionConfig.from_yaml`.
         env: name of the task.
         presets: name of a preset -> names of its conditions, or ``published``.
+        sizes: name of a preset -> its numbers that this benchmark has otherwise.
         headline: end point of the benchmark, a key of `END_POINTS`.
         people: in demonstrations and evaluation.
         face: kind of face, one of `FACES`.
@@ -255,6 +284,7 @@ class ConditionsDocument:
     conditions: Annotated[tuple[Any, ...], Len(1, 1000)]
     env: str = "FeedingEnv"
     presets: dict[str, Any] = field(default_factory=dict)
+    sizes: dict[str, SizeChanges] = field(default_factory=dict)
     headline: str = "success"
     people: DrawnPeople = EVERYBODY
     face: str = FACES[0]
@@ -275,6 +305,7 @@ class ConditionFile:
         headline: end point of the benchmark, a key of `END_POINTS`.
         people: in demonstrations and evaluation.
         face: kind of face.
+        sizes: name of a preset -> its numbers that this benchmark has otherwise.
     """
 
     env: str
@@ -283,6 +314,7 @@ class ConditionFile:
     headline: str = "success"
     people: DrawnPeople = EVERYBODY
     face: str = FACES[0]
+    sizes: Mapping[str, SizeChanges] = field(default_factory=dict)
 
     def choose(self, names: Sequence[str]) -> tuple[ConditionConfig, ...]:
         """Return the conditions of these names, in the order of the file.
@@ -342,6 +374,7 @@ def read_conditions(path: Path) -> ConditionFile:
             document.headline,
             document.people,
             document.face,
+            document.sizes,
         )
         for names in file.presets.values():
             file.choose(names)

@@ -24,7 +24,12 @@ from robo_manip_baselines.benchmark.aggregation import (
     videos_to_make,
     write_aggregation,
 )
-from robo_manip_baselines.benchmark.conditions import CONDITIONS, read_conditions
+from robo_manip_baselines.benchmark.conditions import (
+    AS_IN_THE_PRESET,
+    CONDITIONS,
+    SizeChanges,
+    read_conditions,
+)
 from robo_manip_baselines.benchmark.plan import (
     PRESETS,
     BenchmarkPreset,
@@ -148,12 +153,16 @@ class BenchmarkOptions:
     @property
     def size(self) -> BenchmarkPreset:
         """Preset with the given numbers in place of its own."""
+        return self.size_of(AS_IN_THE_PRESET)
+
+    def size_of(self, changes: SizeChanges) -> BenchmarkPreset:
+        """Return the preset with the numbers of a benchmark, then those given, in place of its."""
         names = "train_seeds", "num_episodes", "demonstrations", "device"
-        changes = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         preset = PRESETS[self.preset]
         settings = parse_settings(self.train_settings, "--train_settings")
-        settings = {**preset.train_settings, **settings}
-        return replace(preset, train_settings=settings, **changes)
+        settings = {**preset.train_settings, **changes.train_settings, **settings}
+        return replace(preset, train_settings=settings, **{**changes.given(), **given})
 
     @property
     def folder(self) -> Path:
@@ -246,8 +255,10 @@ def plan_of(options: BenchmarkOptions) -> Plan:
     """
     path = options.conditions_file or CONDITIONS / f"{options.benchmark}.yaml"
     file = read_conditions(path)
-    for preset in file.presets:
+    for preset in (*file.presets, *file.sizes):
         require_choice(f"preset in '{path}'", preset, PRESETS)
+    changes = file.sizes.get(options.preset, AS_IN_THE_PRESET)
+    size = options.size_of(changes)
     named = tuple(name for part in options.conditions for name in part.split(",") if name)
     conditions = file.conditions
     if chosen := named or file.presets.get(options.preset):
@@ -258,9 +269,10 @@ def plan_of(options: BenchmarkOptions) -> Plan:
         for problem in filter(None, problems.values()):
             logger.warning("left out: %s", problem)
         conditions = tuple(c for c in conditions if not problems[c.name])
-    if given := parse_settings(options.train_settings, "--train_settings"):
+    given = parse_settings(options.train_settings, "--train_settings")
+    if given := {**changes.train_settings, **given}:
         # A policy takes those that it has: at least one must have each.
-        preset = options.size.train_preset
+        preset = size.train_preset
         known = [TrainConfig.from_preset(c.policy, preset, file.env) for c in conditions]
         names = set().union(*(config.to_json() for config in known))
         for name in given:
@@ -268,7 +280,7 @@ def plan_of(options: BenchmarkOptions) -> Plan:
     return make_plan(
         file.env,
         conditions,
-        options.size,
+        size,
         library=options.motion_library,
         error_stats=options.error_stats,
         headline=file.headline,

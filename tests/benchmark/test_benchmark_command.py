@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from robo_manip_baselines.benchmark.conditions import CONDITIONS
+from robo_manip_baselines.benchmark.plan import PRESETS
 from robo_manip_baselines.benchmark.work_item import ArtifactStore
 from robo_manip_baselines.commands import benchmark as command
 from robo_manip_baselines.commands.benchmark import (
@@ -141,6 +142,27 @@ def test_a_condition_that_cannot_be_had_is_left_out_unless_it_is_named(
     assert len(plan_of(options(f"feeding --motion_library {DEFAULT_LIBRARY}")).conditions) == 16
     late = plan_of(options(f"foresight_policies --motion_library {bare}")).conditions
     assert len(late) == 31  # others than `residual` of the library
+
+
+def test_a_file_may_have_other_numbers_than_the_preset(tmp_path: Path) -> None:
+    size = plan_of(options("foresight_policies")).preset
+    assert (size.demonstrations, size.train_seeds, size.num_episodes) == (400, 3, 100)
+    assert size.train_settings == {"steps": 1000}
+    given = "foresight_policies --train_seeds 2 --train_settings steps=2000"
+    size = plan_of(options(given)).preset
+    assert (size.demonstrations, size.train_seeds) == (400, 2)
+    assert size.train_settings == {"steps": 2000}
+    small = plan_of(options("foresight_policies --preset smoke"))
+    assert small.preset == PRESETS["smoke"]
+    mine = tmp_path / "mine.yaml"
+    for text, problem in (
+        ("cpu: {train_settings: {speed: 3}}", "training setting 'speed'"),
+        ("cpu: {train_seeds: 0}", "train_seeds"),
+        ("huge: {train_seeds: 2}", "preset in .*huge"),
+    ):
+        mine.write_text(f"sizes: {{{text}}}\nconditions: [{{name: a}}]")
+        with pytest.raises(RequestError, match=problem):
+            plan_of(options(f"mine --conditions_file {mine}"))
 
 
 def test_a_dry_run_counts_and_writes_nothing(
