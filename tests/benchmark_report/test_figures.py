@@ -184,12 +184,23 @@ def test_little_is_drawn_too(make_rows: MakeRows) -> None:
     )
     statistics = analyze([replace(rows[0], result=result)], task=TASK, resamples=50)
     figures = {figure.name: figure for figure in benchmark_figures(statistics)}
-    names = ["success_by_horizon", "completion_times", "arrivals", "failures", "touches"]
+    names = ["success_by_condition", "completion_times", "arrivals", "failures", "touches"]
     assert list(figures) == names
     for figure in figures.values():
         ElementTree.fromstring(figure.svg)
         assert "paper" not in figure.caption
     assert figures["completion_times"].summary == "No episode succeeded."
+
+
+def test_conditions_without_a_place_on_the_horizon_have_a_row_each(make_rows: MakeRows) -> None:
+    conditions = ["shuffled_future", "current_delay3"]
+    rows = make_rows(conditions=conditions, train_seeds=1, episodes=20)
+    one = [row for row in rows if row.result.condition == conditions[0]]
+    of_both, of_one = (analyze(found, task=TASK, resamples=50) for found in (rows, one))
+    both, alone = benchmark_figures(of_both)[0], benchmark_figures(of_one)[0]
+    assert both.name == alone.name == "success_by_condition"
+    assert all(c.condition.label in " ".join(words(both)) for c in of_both.conditions)
+    assert both.svg.count("<use ") == alone.svg.count("<use ") + 1  # its marker
 
 
 def test_a_task_with_kinds_of_failure_of_its_own(make_rows: MakeRows) -> None:

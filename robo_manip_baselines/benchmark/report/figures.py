@@ -172,8 +172,12 @@ def benchmark_figures(statistics: BenchmarkStatistics) -> tuple[ReportFigure, ..
         RequestError: matplotlib is not installed.
     """
     success = statistics.end_point.capitalize()
+    first = "success_by_horizon", f"{success} against the horizon", draw_success_by_horizon
+    series = {(group, error) for group, error, *_ in HORIZON_SERIES}
+    if not any((c.condition.group, c.condition.error) in series for c in statistics.conditions):
+        first = "success_by_condition", f"{success} by condition", draw_success_by_condition
     figures: list[tuple[str, str, Draw]] = [
-        ("success_by_horizon", f"{success} against the horizon", draw_success_by_horizon),
+        first,
         ("completion_times", "Completion times", draw_completion_times),
         *((f.name, f.title, draw_episodes(f)) for f in statistics.study.figures),
         ("failures", "How episodes ended", draw_failures),
@@ -200,17 +204,47 @@ def write_figures(folder: Path, figures: Sequence[ReportFigure]) -> list[Path]:
     return paths
 
 
+HORIZON_SERIES = (
+    (BASELINE, "none", GREY, "", 0.12),
+    (CURRENT, "none", INK, "", 0.12),
+    (PREDICTION, "none", BLUE, "without error", -0.06),
+    (PREDICTION, WITH_ERROR, ORANGE, "with error", 0.06),
+)
+"""Group and error of the conditions against the horizon; colour, label, and shift of markers."""
+
+
+def draw_success_by_condition(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
+    """Draw the rate of success, one row for each condition."""
+    conditions = statistics.conditions
+    figure.set_size_inches(8.0, 0.9 + 0.34 * len(conditions))
+    axes = figure.add_subplot()
+    for row, c in enumerate(conditions):
+        found = statistics.rate(c)
+        if found.rate is None or found.low is None or found.high is None:
+            continue
+        axes.plot([100.0 * found.low, 100.0 * found.high], [row, row], color=INK, lw=2)
+        axes.plot(100.0 * found.rate, row, "o", color=INK, ms=5)
+    _label_rows(axes, conditions)
+    axes.set(xlabel=f"{statistics.end_point}, %", xlim=(-2.0, 102.0))
+    axes.grid(axis="x")
+    best = max(conditions, key=lambda c: statistics.rate(c).rate or 0.0)
+    highest = f"“{best.condition.label}”, {statistics.rate(best)}"
+    return _bars_caption(statistics), f"The highest rate is that of {highest}."
+
+
+def _bars_caption(statistics: BenchmarkStatistics) -> str:
+    """Say what the bars of rates are."""
+    many = statistics.has_many_train_seeds
+    seeds = " over training and evaluation seeds" if many else " (Wilson)"
+    return f"Bands and bars: 95 % intervals{seeds}."
+
+
 def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tuple[str, str]:
     """Draw success against the horizon, with and without error, and published results."""
     figure.set_size_inches(8.0, 4.6)
     axes, last = figure.add_subplot(), 0
     conditions, study = statistics.conditions, statistics.study
-    for group, error, color, label, shift in (
-        (BASELINE, "none", GREY, "", 0.12),
-        (CURRENT, "none", INK, "", 0.12),
-        (PREDICTION, "none", BLUE, "without error", -0.06),
-        (PREDICTION, WITH_ERROR, ORANGE, "with error", 0.06),
-    ):
+    for group, error, color, label, shift in HORIZON_SERIES:
         series = (group, error)
         own = [c for c in conditions if (c.condition.group, c.condition.error) == series]
         if not own:
@@ -241,10 +275,7 @@ def draw_success_by_horizon(figure: Any, statistics: BenchmarkStatistics) -> tup
     axes.grid(axis="y")
     if axes.get_legend_handles_labels()[1]:
         figure.legend(loc="outside lower center", ncols=4, fontsize=9)
-    seeds = (
-        " over training and evaluation seeds" if statistics.has_many_train_seeds else " (Wilson)"
-    )
-    caption = f"Bands and bars: 95 % intervals{seeds}."
+    caption = _bars_caption(statistics)
     if _has_published(statistics) and statistics.measure == "success":
         caption += f" Hollow markers: {_paper(study.success_table)}, {study.trials} episodes each."
     best = max(conditions, key=lambda c: statistics.rate(c).rate or 0.0)
