@@ -220,13 +220,16 @@ def test_in_a_browser(recorded: list[Path], browser: Any) -> None:
     """Headless Chromium draws the scene, and its slider moves everything."""
     pytest.importorskip("viser", reason="pip install viser")
     command = [sys.executable, str(SCRIPT), "view", *map(str, recorded), "--port", "0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    with (
+        # A page that stays open draws on, which without a GPU takes a core from later tests.
+        closing(browser.new_page(viewport={"width": 1300, "height": 850})) as page,
+        subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process,
+    ):
         assert process.stderr is not None
         try:
             line = process.stderr.readline()
             found = re.search(r"2 episodes at (http://127\.0\.0\.1:\d+/)", line)
             assert found, line
-            page = browser.new_page(viewport={"width": 1300, "height": 850})
             page.set_default_timeout(120_000)  # WebGL without a GPU takes long to start
             errors: list[str] = []
             page.on("pageerror", lambda error: errors.append(str(error)))

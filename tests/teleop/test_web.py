@@ -202,19 +202,22 @@ class Session:
         return np.array([float(part) for part in self.text("gripper").split()])
 
     def go(self, place: np.ndarray) -> None:
-        """Bring the gripper to a place (3,) m by keys of 5 mm."""
-        for _ in range(60):
-            steps = np.round((place - self.gripper) / 0.005).astype(int)
-            if not steps.any():
-                return
-            for axis, (less, more) in enumerate((("a", "d"), ("s", "w"), ("q", "e"))):
-                for _ in range(min(abs(steps[axis]), 25)):
-                    self.page.keyboard.press(more if steps[axis] > 0 else less)
-            before = np.full(3, np.inf)
-            while np.abs(self.gripper - before).max() > 5e-4:
-                before = self.gripper
-                time.sleep(0.5)
-        raise AssertionError(f"the gripper is at {self.gripper}, not at {place}")
+        """Bring the gripper to a place (3,) m by keys of 5 mm.
+
+        Each few keys are waited for where they lead: a page that is late shows an old place, from
+        which one would steer too far.
+        """
+        goal = self.gripper
+        steps = np.round((place - goal) / 0.005).astype(int)
+        for axis, (less, more) in enumerate((("a", "d"), ("s", "w"), ("q", "e"))):
+            key, left = more if steps[axis] > 0 else less, abs(int(steps[axis]))
+            while left:
+                count = min(left, 10)
+                for _ in range(count):
+                    self.page.keyboard.press(key)
+                goal[axis] += np.sign(steps[axis]) * count * 0.005
+                self.wait(lambda: bool(np.allclose(self.gripper, goal, atol=2e-3)), f"to {goal}")
+                left -= count
 
     def close(self) -> None:
         self.page.close()
