@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from robo_manip_baselines.policy.act.cameras import CameraEncoder
 from robo_manip_baselines.policy.act.config import ActConfig
+from robo_manip_baselines.policy.act.inference import Prediction
 from robo_manip_baselines.policy.act.resnet import (
     ResNet18,
     feature_size,
@@ -349,6 +350,7 @@ class ActModel(PolicyModel):
         num_run = 1 if config.paper_compat else config.decoder_layers
         self.decoder = Decoder(config, config.decoder_layers, num_run)
         self.action_head = ExactLinear(width, config.actions_per_query * dims.action)
+        self.prediction: Prediction | None = None  # of a copy for inference
         if config.backbone_weights is not None:
             load_backbone(self.vision and self.vision.backbone, config.backbone_weights)
 
@@ -373,13 +375,16 @@ class ActModel(PolicyModel):
 
     def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return normalised actions (B, K, A) for the mean of the latent's prior, 0."""
+        if self.prediction is not None:
+            return self.prediction(state, images)
         return self._actions(state, images, None)
 
     def for_inference(self, dtype: torch.dtype) -> ActModel:
         """Return a copy that predicts the same, faster, and cannot be trained.
 
         Frozen normalisation is folded into the kernels once, and the weights are held in
-        ``dtype`` where autocast would cast all of them on every call: no autocast is needed.
+        ``dtype`` where autocast would cast all of them on every call: no autocast is needed. It is
+        moved to its device before it predicts, see `Prediction`.
 
         Args:
             dtype: of the matrix products: ``torch.float32`` or ``torch.bfloat16``; the layer
@@ -391,6 +396,7 @@ class ActModel(PolicyModel):
         for module in model.modules():
             if isinstance(module, Linear | nn.Conv2d):
                 module.to(dtype)
+        model.prediction = Prediction(model)
         return model.requires_grad_(False)
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, object]]:
