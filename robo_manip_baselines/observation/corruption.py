@@ -378,7 +378,7 @@ class CorruptionPipeline:
             late, observed = 0.0, position[row].copy()
         at = np.array([row]), np.array([late]), np.array([error_frame])
         self._corrupt(observed[None], error, time, position, predicted, at)
-        return TargetObservation(np.float64(seen), observed)
+        return TargetObservation(np.asarray(seen), observed)
 
     def _corrupt(
         self,

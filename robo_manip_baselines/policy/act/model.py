@@ -124,13 +124,14 @@ class Attention(nn.Module):
         """Return (B, L, D).
 
         Args:
-            query_BLD: queries, with their positions.
+            query_BLD: queries, with their positions; (1, L, D) where they are the same for all.
             key_BMD: keys, with their positions.
             value_BMD: values: the same tokens without.
             keep_BM: bool, False for tokens to mask out; None for no mask.
         """
         projected = self.query(query_BLD), self.key(key_BMD), self.value(value_BMD)
         heads = [x_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for x_BLD in projected]
+        heads[0] = heads[0].expand(len(key_BMD), -1, -1, -1)
         mask = None if keep_BM is None else keep_BM[:, None, None, :]
         attended_BGLE = nn.functional.scaled_dot_product_attention(*heads, attn_mask=mask)
         return self.out(attended_BGLE.transpose(1, 2).flatten(2))
@@ -253,7 +254,7 @@ class Decoder(nn.Module):
     def __init__(self, config: ActConfig, num_layers: int, num_run: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(DecoderLayer(config) for _ in range(num_layers))
-        self.num_run = num_run
+        self.num_run, self.dropout = num_run, config.dropout
         self.norm = LayerNorm(config.hidden_size)
         _initialize(self)
         # What is never run has no gradient, and distributed training waits for every gradient.
@@ -267,7 +268,10 @@ class Decoder(nn.Module):
             memory_BMD: tokens of the encoder.
             position_MD: their positions.
         """
-        x_BLD = query_LD.new_zeros((memory_BMD.shape[0], *query_LD.shape))
+        # Up to the first cross-attention all examples are the same but for what is dropped. One
+        # will do in training; predictions would round otherwise than those of earlier releases.
+        batch = 1 if self.training and self.dropout == 0.0 else len(memory_BMD)
+        x_BLD = query_LD.new_zeros((batch, *query_LD.shape))
         # The positions of the memory are the same in every layer: added once.
         memory_key_BMD = memory_BMD + position_MD
         for layer in self.layers[: self.num_run]:
