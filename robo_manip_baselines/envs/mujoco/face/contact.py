@@ -235,7 +235,7 @@ class FaceTouch:
                 point = in_head.point(hardest[key][1])
                 self._found[key] = FaceContact(*key, force, impulse, point)
             else:
-                self._found[key] = before._replace(impulse=impulse)
+                self._found[key] = FaceContact(*key, before.force, impulse, before.point)
 
     @property
     def contacts(self) -> tuple[FaceContact, ...]:
