@@ -55,6 +55,11 @@ class DenoisingConfig:
             et al. (32).
         max_guidance: largest weight of the guidance with --strategy rtc (Black et al. 2025, arXiv
             2506.07339: 5).
+        sampling_noise: standard deviation of the noise that predictions begin with, and of any that
+            is added on the way; in training it is 1. With 1 a prediction is drawn from the learned
+            distribution. With 0 the same is predicted each time, which is steadier where the
+            demonstrations have one way to do it (Pan et al. 2025, arXiv 2512.01809, begin with 0,
+            too).
 
     Raises:
         RequestError: a value that is not valid.
@@ -73,6 +78,7 @@ class DenoisingConfig:
     vision: Literal["resnet18", "small"] = "resnet18"
     keypoints: Annotated[int, Interval(ge=1, le=4096)] = 32
     max_guidance: Annotated[float, Interval(ge=0.0, le=1e6)] = 5.0
+    sampling_noise: Annotated[float, Interval(ge=0.0, le=10.0)] = 1.0
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -156,7 +162,7 @@ def denoising_presets(
             image_size=(96, 128),
         ),
         "cpu": PolicyPreset(
-            config=kind(**_SMALL, backbone="perceptron", **(cpu or {})),
+            config=kind(**_SMALL, backbone="perceptron", sampling_noise=0.0, **(cpu or {})),
             training=STATE_ONLY_TRAINING,
             execution=execution,
             cameras=(),

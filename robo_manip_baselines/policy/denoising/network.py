@@ -231,6 +231,7 @@ class DenoisingModel(PolicyModel):
         super().__init__()
         self.chunk_size, self.n_obs_steps = config.chunk_size, config.n_obs_steps
         self.action_size, self.max_guidance = dims.action, config.max_guidance
+        self.sampling_noise = config.sampling_noise
         self.strategies = ("rtc",)
         width = config.hidden_size
         self.vision = ImageEncoder(config.vision, config.keypoints) if dims.cameras else None
@@ -264,7 +265,7 @@ class DenoisingModel(PolicyModel):
 
     def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return normalised actions (B, K, A)."""
-        return self.sample(self.observe(state, images), noise)
+        return self.sample(self.observe(state, images), self.scaled(noise))
 
     def inpaint(
         self,
@@ -275,7 +276,11 @@ class DenoisingModel(PolicyModel):
         weight: Tensor,
     ) -> Tensor:
         """Return a chunk that is guided towards ``action``: real-time chunking."""
-        return self.sample(self.observe(state, images), noise, action, weight)
+        return self.sample(self.observe(state, images), self.scaled(noise), action, weight)
+
+    def scaled(self, noise: Tensor | None) -> Tensor | None:
+        """Return the noise of predictions, of which ``noise`` (B, Z) has a deviation of 1."""
+        return noise if noise is None else self.sampling_noise * noise
 
     def observe(self, state: Tensor, images: Tensor | None) -> Tensor:
         """Return the embedded observation (B, D) of (B, O, S) and (B, O, N, H, W, 3)."""

@@ -87,7 +87,8 @@ class FlowModel(DenoisingModel):
         weight: Tensor,
     ) -> Tensor:
         """Return a chunk whose steps of weight 1 are those of ``action``, as in training."""
-        return self.sample(self.observe(state, images), noise, action, fixed=weight >= 1.0)
+        observed, fixed = self.observe(state, images), weight >= 1.0
+        return self.sample(observed, self.scaled(noise), action, fixed=fixed)
 
     def _guided_velocity(
         self, observed: Tensor, position: Tensor, time: float, action: Tensor, weight: Tensor
