@@ -4,9 +4,9 @@ Lets a trained policy act through the same episodes several times, trains one of
 steps, and prints a Markdown table and the time of a whole study. All of it is the processor time of
 one thread, as a work item of a benchmark has.
 
-Other programs on a machine slow a processor down. A repeated call does the same work, so the sum of
-the fastest of each call (and the fastest tenth of training steps) comes close to the time on a core
-that nobody else uses; it stands beside the mean.
+Other programs on a machine slow a processor down. A repeated call does the same work, so beside the
+mean stands the sum of the fastest of each call, and the fastest tenth of training steps: what is
+left of the difference to an idle machine is what never pauses.
 
     python benchmarks/study_time.py --checkpoint runs/current --dataset dataset/feeding
 
@@ -45,13 +45,13 @@ from robo_manip_baselines.training.setup import TrainSetup  # noqa: E402
 from robo_manip_baselines.training.trainer import Trainer  # noqa: E402
 
 Parts = dict[str, list[float]]
-"""Part -> s in the mean, and s undisturbed."""
+"""Part -> s in the mean, and s of the fastest calls."""
 
 WARM_UP = 3
 """Steps of training before the clock runs."""
 
 SHARE = 10.0
-"""% of training steps that count as undisturbed."""
+"""% of training steps that count as the fastest."""
 
 START = """
 from robo_manip_baselines.rollout import evaluation
@@ -112,7 +112,7 @@ class Meter:
 
 
 def time_evaluation(options: Options) -> tuple[Parts, float]:
-    """Return s of each part a control step, mean and undisturbed, and the steps of an episode."""
+    """Return s of each part a control step, mean and fastest, and the steps of an episode."""
     meter = Meter()
     meter.watch(mujoco, "mj_step")
     meter.watch(LocalEnvs, "submit")
@@ -150,7 +150,7 @@ def time_evaluation(options: Options) -> tuple[Parts, float]:
 
 
 def time_training(options: Options) -> tuple[Parts, int, float]:
-    """Return s of each part of a step, mean and undisturbed, the steps, and s of the start."""
+    """Return s of each part of a step, mean and fastest, the steps, and s of the start."""
     plan = EvaluationPlan.of(EvaluationConfig(options.checkpoint, range(1), device="cpu"))
     words = [plan.checkpoint.policy, "--preset", "cpu", "--dataset", str(options.dataset)]
     config = parse_config([*words, "--logger", "none", "--device", "cpu"])
@@ -194,7 +194,7 @@ def time_start() -> float:
 
 def table(title: str, parts: Parts) -> str:
     """Return a Markdown table of parts in ms, and their sum."""
-    lines = [f"| {title} | ms | % | ms, undisturbed | % |", "|---|--:|--:|--:|--:|"]
+    lines = [f"| {title} | ms | % | ms, fastest | % |", "|---|--:|--:|--:|--:|"]
     mean, least = (sum(values) for values in zip(*parts.values(), strict=True))
     for name, (one, other) in [*parts.items(), ("all", [mean, least])]:
         shares = 100.0 * one / mean, 100.0 * other / least
@@ -217,7 +217,7 @@ def main() -> None:
     print(table("a control step", acting))
     print(table("a step of training", training))
     items = -(-options.num_episodes // options.episode_block)
-    print(f"| {options.trainings} times | s | s, undisturbed |\n|---|--:|--:|")
+    print(f"| {options.trainings} times | s | s, fastest |\n|---|--:|--:|")
     rows = []
     for kind in (0, 1):
         one = train_steps * sum(values[kind] for values in training.values()) + load + start
@@ -233,7 +233,7 @@ def main() -> None:
     sums = [sum(row) for row in rows]
     hours = [options.trainings * value / 3600.0 for value in sums]
     print(f"| all | {sums[0]:.0f} | {sums[1]:.0f} |")
-    print(f"\nThe study: {hours[0]:.1f} hours of a core; undisturbed {hours[1]:.1f}")
+    print(f"\nThe study: {hours[0]:.1f} hours of a core; by the fastest calls {hours[1]:.1f}")
 
 
 if __name__ == "__main__":
