@@ -208,8 +208,11 @@ def evaluate(options: Options, training: Training, folder: Path) -> None:
     """Evaluate the weights in a folder beside the baselines, unless that is done."""
     out = options.out / EVALUATIONS / training.evaluation
     path, digest = out / RESULTS, file_digest(folder / "model.safetensors")
-    if path.is_file() and [c["sha256"] for c in read_json(path)["checkpoints"]] == [digest]:
-        return
+    if path.is_file():
+        done = read_json(path)
+        is_same = [c["sha256"] for c in done["checkpoints"]] == [digest]
+        if is_same and set(options.kinds) <= set(done["kinds"]):
+            return
     run_evaluate(
         EvaluateOptions(
             options.dataset,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -55,9 +56,9 @@ def approaches(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         size = {"cross_attention": 0.02, "simple_fusion": 0.03, "image_only": None}[network]
         rows = [row("persistence", 0.01, 0.9)]
         rows.append(row(network, None if size is None else size + 0.001 * seed, 0.8))
-        kinds = {"natural": {"rows": rows, "sequences": 15}}
+        kinds = {kind: {"rows": rows, "sequences": 15} for kind in options.kinds}
         record = {"kinds": kinds, "checkpoints": [{"sha256": file_digest(folder / MODEL)}]}
-        options.out.mkdir(parents=True)
+        options.out.mkdir(parents=True, exist_ok=True)
         write_json(options.out / "results.json", record)
         return 0
 
@@ -81,8 +82,10 @@ def row(name: str, error: float | None, ssim: float) -> dict:
     return {"name": name, "numbers": numbers, "missing": [0] * 5}
 
 
-def run(approaches: ModuleType, monkeypatch, out: Path, *words: str) -> None:
-    arguments = ["approaches.py", "--splits", "sequence", "--kinds", "natural", "--out", str(out)]
+def run(
+    approaches: ModuleType, monkeypatch, out: Path, *words: str, kinds: Sequence[str] = ("natural",)
+) -> None:
+    arguments = ["approaches.py", "--splits", "sequence", "--kinds", *kinds, "--out", str(out)]
     monkeypatch.setattr(sys, "argv", [*arguments, *words])
     approaches.main()
 
@@ -123,8 +126,17 @@ def test_what_is_done_is_not_done_again_and_more_steps_extend_it(
     )
     assert approaches.trained == [(name, 200)]
     assert approaches.evaluated == [evaluation]
-    (tmp_path / "evaluations" / evaluation / "results.json").rename(tmp_path / "old.json")
-    (tmp_path / "evaluations" / evaluation).rmdir()
+    run(
+        approaches,
+        monkeypatch,
+        tmp_path,
+        *words,
+        "--steps",
+        "200",
+        kinds=("head_motion", "natural"),
+    )
+    run(approaches, monkeypatch, tmp_path, *words, "--steps", "200")  # are among those
+    assert approaches.evaluated == [evaluation] * 2
     run(approaches, monkeypatch, tmp_path, *words, "--steps", "400")
     assert approaches.trained == [(name, 200), (name, 400)]
     assert read_json(tmp_path / "runs" / name / "config.json")["training"]["steps"] == 400

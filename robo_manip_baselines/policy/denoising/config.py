@@ -40,6 +40,9 @@ class DenoisingConfig:
         target: of the network: noise, as published (with Flow the velocity, action less noise), or
             action, from which the noise follows. Actions fill few of the dimensions that noise
             fills: a small network learns them sooner.
+        loss: of the target: l2, the mean squared error, as published, with which a policy learns
+            the distribution; or l1, the mean absolute error, with which it learns medians: a
+            gripper that is to open at one of several steps is open or closed, and never half open.
         n_obs_steps: O, observation steps, the present one last (Chi et al.: 2).
         channels: of the levels of the U-Net, each but the last halving the steps (Chi et al.
             without images: 256, 512, 1024).
@@ -55,6 +58,11 @@ class DenoisingConfig:
             et al. (32).
         max_guidance: largest weight of the guidance with --strategy rtc (Black et al. 2025, arXiv
             2506.07339: 5).
+        sampling_noise: standard deviation of the noise that predictions begin with, and of any that
+            is added on the way; in training it is 1. With 1 a prediction is drawn from the learned
+            distribution. With 0 the same is predicted each time, which is steadier where the
+            demonstrations have one way to do it (Pan et al. 2025, arXiv 2512.01809, begin with 0,
+            too).
 
     Raises:
         RequestError: a value that is not valid.
@@ -63,6 +71,7 @@ class DenoisingConfig:
     chunk_size: Chunk = 16
     backbone: Literal["unet", "transformer", "perceptron"] = "unet"
     target: Literal["noise", "action"] = "noise"
+    loss: Literal["l2", "l1"] = "l2"
     n_obs_steps: Annotated[int, Interval(ge=1, le=64)] = 2
     channels: tuple[Width, ...] = (256, 512, 1024)
     kernel_size: Annotated[int, Interval(ge=1, le=63)] = 5
@@ -73,6 +82,7 @@ class DenoisingConfig:
     vision: Literal["resnet18", "small"] = "resnet18"
     keypoints: Annotated[int, Interval(ge=1, le=4096)] = 32
     max_guidance: Annotated[float, Interval(ge=0.0, le=1e6)] = 5.0
+    sampling_noise: Annotated[float, Interval(ge=0.0, le=10.0)] = 1.0
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -100,7 +110,7 @@ class DenoisingConfig:
             return count + self.num_layers * 16 * width**2
         if self.backbone == "perceptron":
             chunk = 2 * 4 * width * self.chunk_size * dims.action
-            return count + chunk + self.num_layers * (2 * 16 + 2 * 2 * 4) * width**2
+            return count + chunk + (8 + self.num_layers * (2 * 16 + 2 * 2 * 4)) * width**2
         for below, channels in zip((0, *self.channels), self.channels, strict=False):
             down = channels * (below + 3 * channels)
             up = below * (2 * channels + 3 * below)
@@ -122,6 +132,10 @@ _SMALL: dict[str, Any] = {
     "target": "action",
 }
 """Sizes in the presets for a processor without a GPU."""
+
+_ONE_WAY: dict[str, Any] = {"loss": "l1", "sampling_noise": 0.0}
+"""For demonstrations of a scripted expert, which has one way to do it; docs/policies.md has the
+success without."""
 
 _PAPER_TRAINING = TrainSettings(
     batch_size=16,
@@ -156,7 +170,7 @@ def denoising_presets(
             image_size=(96, 128),
         ),
         "cpu": PolicyPreset(
-            config=kind(**_SMALL, backbone="perceptron", **(cpu or {})),
+            config=kind(**_SMALL, **_ONE_WAY, backbone="perceptron", n_obs_steps=1, **(cpu or {})),
             training=STATE_ONLY_TRAINING,
             execution=execution,
             cameras=(),

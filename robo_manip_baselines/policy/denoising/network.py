@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -148,7 +149,7 @@ class ChunkPerceptron(nn.Module):
         super().__init__()
         chunk, width = config.chunk_size, 4 * config.hidden_size
         self.shape = chunk, channels_out
-        self.first = nn.Linear(chunk * channels_in, width)
+        self.first = nn.Linear(chunk * channels_in + 2 * config.hidden_size, width)
         self.modulation = nn.Linear(2 * config.hidden_size, 2 * width * config.num_layers)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(config.num_layers))
         self.widen = nn.ModuleList(nn.Linear(width, width) for _ in range(config.num_layers))
@@ -160,7 +161,7 @@ class ChunkPerceptron(nn.Module):
         """Return (B, K, A) from actions (B, K, A'), embedded level and observation (B, D) each."""
         condition = self.activation(torch.cat([time, observation], dim=1))
         modulations = iter(self.modulation(condition).chunk(2 * len(self.norms), dim=1))
-        x = self.first(action.flatten(1))
+        x = self.first(torch.cat([action.flatten(1), time, observation], dim=1))
         for norm, widen, narrow in zip(self.norms, self.widen, self.narrow, strict=True):
             hidden = norm(x) * (1.0 + next(modulations)) + next(modulations)
             x = x + narrow(self.activation(widen(hidden)))
@@ -231,6 +232,7 @@ class DenoisingModel(PolicyModel):
         super().__init__()
         self.chunk_size, self.n_obs_steps = config.chunk_size, config.n_obs_steps
         self.action_size, self.max_guidance = dims.action, config.max_guidance
+        self.sampling_noise, self.error = config.sampling_noise, config.loss
         self.strategies = ("rtc",)
         width = config.hidden_size
         self.vision = ImageEncoder(config.vision, config.keypoints) if dims.cameras else None
@@ -264,7 +266,7 @@ class DenoisingModel(PolicyModel):
 
     def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return normalised actions (B, K, A)."""
-        return self.sample(self.observe(state, images), noise)
+        return self.sample(self.observe(state, images), self.scaled(noise))
 
     def inpaint(
         self,
@@ -275,7 +277,11 @@ class DenoisingModel(PolicyModel):
         weight: Tensor,
     ) -> Tensor:
         """Return a chunk that is guided towards ``action``: real-time chunking."""
-        return self.sample(self.observe(state, images), noise, action, weight)
+        return self.sample(self.observe(state, images), self.scaled(noise), action, weight)
+
+    def scaled(self, noise: Tensor | None) -> Tensor | None:
+        """Return the noise of predictions, of which ``noise`` (B, Z) has a deviation of 1."""
+        return noise if noise is None else self.sampling_noise * noise
 
     def observe(self, state: Tensor, images: Tensor | None) -> Tensor:
         """Return the embedded observation (B, D) of (B, O, S) and (B, O, N, H, W, 3)."""
@@ -335,7 +341,8 @@ def filled(batch: Batch) -> Tensor:
     return torch.where(batch.is_pad[..., None], batch.action.gather(1, last), batch.action)
 
 
-def squared_error(found: Tensor, wanted: Tensor, batch: Batch) -> Tensor:
-    """Return the mean squared error over all steps of (B, K, A), with the weights of the batch."""
-    error = batch.weighted((found - wanted).square())
+def mean_error(found: Tensor, wanted: Tensor, batch: Batch, loss: Literal["l1", "l2"]) -> Tensor:
+    """Return the mean error over all steps of (B, K, A), with the weights of the batch."""
+    difference = found - wanted
+    error = batch.weighted(difference.abs() if loss == "l1" else difference.square())
     return error.sum() / (batch.num_examples * math.prod(found.shape[1:]))

@@ -17,7 +17,7 @@ from robo_manip_baselines.policy.denoising.network import (
     DenoisingModel,
     filled,
     guidance,
-    squared_error,
+    mean_error,
 )
 from robo_manip_baselines.policy.diffusion.config import DiffusionConfig
 from robo_manip_baselines.policy.interface import Batch, PolicyDims
@@ -56,7 +56,7 @@ class DiffusionModel(DenoisingModel):
         self.action_range = config.clip_sample or None
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the mean squared error of noise or action as ``loss``."""
+        """Return the mean error of noise or action as ``loss``."""
         action, levels = filled(batch), self.config.diffusion_steps
         noise = batch.noise[:, :-1].view_as(action)
         level = (torch.special.ndtr(batch.noise[:, -1]) * levels).long().clamp(max=levels - 1)
@@ -65,7 +65,7 @@ class DiffusionModel(DenoisingModel):
         observed = self.observe(batch.state, batch.images)
         found = self.found(observed, noisy, level / levels)
         wanted = action if self.finds_action else noise
-        return {"loss": squared_error(found, wanted, batch)}
+        return {"loss": mean_error(found, wanted, batch, self.error)}
 
     def sample(
         self,

@@ -12,7 +12,7 @@ from robo_manip_baselines.policy.denoising.network import (
     DenoisingModel,
     filled,
     guidance,
-    squared_error,
+    mean_error,
 )
 from robo_manip_baselines.policy.flow.config import FlowConfig
 from robo_manip_baselines.policy.interface import Batch, PolicyDims
@@ -35,7 +35,7 @@ class FlowModel(DenoisingModel):
         self.max_delay = config.max_prefix
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the mean squared error of velocity or action as ``loss``."""
+        """Return the mean error of velocity or action as ``loss``."""
         action, size = filled(batch), self.sample_noise_size
         noise = batch.noise[:, :size].view_as(action)
         time = torch.special.ndtr(batch.noise[:, size])  # uniform from 0 to 1
@@ -44,7 +44,7 @@ class FlowModel(DenoisingModel):
         wanted = action if self.finds_action else action - noise
         if not self.marks_prefix:
             found = self.found(observed, position, time)
-            return {"loss": squared_error(found, wanted, batch)}
+            return {"loss": mean_error(found, wanted, batch, self.error)}
         # Each length from 0 to max_prefix is as likely; fixed steps are no error.
         length = torch.special.ndtr(batch.noise[:, size + 1]) * (self.max_prefix + 1)
         steps = torch.arange(self.chunk_size, device=action.device)
@@ -52,7 +52,7 @@ class FlowModel(DenoisingModel):
         position = torch.where(is_fixed[..., None], action, position)
         found = self.found(observed, position, time, is_fixed)
         found = torch.where(is_fixed[..., None], wanted, found)
-        return {"loss": squared_error(found, wanted, batch)}
+        return {"loss": mean_error(found, wanted, batch, self.error)}
 
     def sample(
         self,
@@ -87,7 +87,8 @@ class FlowModel(DenoisingModel):
         weight: Tensor,
     ) -> Tensor:
         """Return a chunk whose steps of weight 1 are those of ``action``, as in training."""
-        return self.sample(self.observe(state, images), noise, action, fixed=weight >= 1.0)
+        observed, fixed = self.observe(state, images), weight >= 1.0
+        return self.sample(observed, self.scaled(noise), action, fixed=fixed)
 
     def _guided_velocity(
         self, observed: Tensor, position: Tensor, time: float, action: Tensor, weight: Tensor
