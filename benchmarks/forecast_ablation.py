@@ -45,14 +45,13 @@ from face_prediction.models.residual.predictor import (
 WHOLE = "nothing"
 MIXING: dict[str, dict[str, float]] = {
     "weights by errors (all experts alike)": {"SHARPNESS": 0.0},
-    "caution at rest": {"CAUTION": 0.0, "FAR_CAUTION": 0.0},
-    "long memory of weights (40 frames)": {"WEIGHT_MEMORY": 40.0},
+    "caution at rest": {"CAUTION": 0.0},
 }
 """Parts of the mixture that a constant of `adaptive` switches off, and its value then."""
 ROWS: dict[str, dict[str, float]] = {
-    "rows of overlapping errors count less": {"OVERLAP": 0.0},
+    "overlapping errors count less": {"OVERLAP": 0.0},
 }
-"""The same, of what a face teaches."""
+"""The same, of what a face teaches as well."""
 LEARNING = "learning from the face"
 SHRINKAGE = "covariance between people (plain ridge)"
 _NEVER = 60.0  # logarithm of an expert's error that leaves it without weight

@@ -16,13 +16,15 @@ from face_prediction.models.residual.adaptive import (
     BANDS,
     CALM,
     HORIZONS,
+    LEARNT_MEMORY,
     OVERLAP,
     ROBUST,
+    SHARPNESS,
     FaceState,
     Mixture,
     Ring,
 )
-from face_prediction.models.residual.experts import EXPERTS, SERIES, LinearExpert, slow_means
+from face_prediction.models.residual.experts import EXPERTS, SERIES, SLOW, LinearExpert, slow_means
 from face_prediction.models.residual.fit import (
     Rows,
     fit_linear,
@@ -215,10 +217,8 @@ def test_learning_is_weighted_ridge_regression() -> None:
     rng = np.random.default_rng(3)
     tracks = [np.cumsum(rng.normal(0, 0.01, (150, SERIES)), axis=0) for _ in range(4)]
     fit = fit_people(tracks, list("abcd"))
-    index = 3  # the first that adapts
-    linear = [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
-    expert, part = linear[index], fit.linear[index]
-    number = EXPERTS.index(expert)
+    index = 1  # the first that adapts
+    expert, part = EXPERTS[index], fit.linear[index]
     assert part.precision is not None
     state = FaceState(fit, 1)
     path = np.cumsum(rng.normal(0, 0.01, (60, SERIES)), axis=0)
@@ -229,7 +229,7 @@ def test_learning_is_weighted_ridge_regression() -> None:
         forecast = state.forecast()
         state.remember(forecast)
         rows.append(forecast.features[index][0])
-        made.append(forecast.experts[0, number])
+        made.append(forecast.experts[0, index])
     error = np.array(made)
     last = len(path) - 1
     for band, precision in zip(BANDS, part.precision, strict=True):
@@ -244,7 +244,7 @@ def test_learning_is_weighted_ridge_regression() -> None:
                 ratio = np.abs(missed).mean() / known[band.knots.start]
                 usual, at = known[band.usual], HORIZONS[band.usual]
                 weight = 1 / (1 + OVERLAP * (at - 1)) / usual**2 / np.hypot(ratio, ROBUST)
-                weight *= np.exp(-(last - horizon - row) / expert.memory)
+                weight *= np.exp(-(last - horizon - row) / LEARNT_MEMORY)
                 x = rows[row]
                 outcome = path[row + horizon] - path[row] - x @ part.people[place]
                 gram += weight * np.outer(x, x)
@@ -257,7 +257,7 @@ def test_learning_is_weighted_ridge_regression() -> None:
 def test_what_was_learnt_counts_little_at_rest(predictor: ResidualPredictor) -> None:
     people = predictor.fit.people
     mixture = Mixture(replace(people, usual=np.zeros_like(people.usual)), 2)
-    adapts = np.array([isinstance(e, LinearExpert) and e.adapts for e in EXPERTS], dtype=float)
+    adapts = np.array([not expert.iterated for expert in EXPERTS], dtype=float)
     experts = np.tile(adapts[None, :, None, None], (2, 1, len(HORIZONS), SERIES))
     steps = np.array([0.02, 3.0])[:, None, None] * CALM
     recent = steps * np.arange(9)[:, None] * np.ones(SERIES)
@@ -269,6 +269,21 @@ def test_what_was_learnt_counts_little_at_rest(predictor: ResidualPredictor) -> 
     for _ in range(3000):
         mixture.take(steps[:, 0, 0])
     assert np.all(mixture.mix(experts, recent)[0][0] > 0.1)  # proven by now
+
+
+def test_weights_fall_with_errors_less_so_far_ahead(predictor: ResidualPredictor) -> None:
+    people = predictor.fit.people
+    usual = np.zeros_like(people.usual)
+    usual[0, :, 0] = np.log(1.1)  # the first expert errs 10 % more than the others
+    mixture = Mixture(replace(people, usual=usual), 1)
+    mixture.take(np.array([CALM]))
+    experts = np.zeros((1, len(EXPERTS), len(HORIZONS), SERIES))
+    experts[:, 0] = 1.0
+    moving = 3 * CALM * np.arange(9)[:, None] * np.ones((1, 1, SERIES))
+    share = mixture.mix(experts, moving)[0][0, :, 0]
+    for place, horizon in enumerate(HORIZONS):
+        weight = np.exp(-SHARPNESS * 0.1 / np.sqrt(1 + OVERLAP * (horizon - 1)))
+        assert share[place] == pytest.approx(weight / (weight + len(EXPERTS) - 1))
 
 
 def test_mixing_again_is_what_following_does(predictor: ResidualPredictor) -> None:
@@ -290,7 +305,7 @@ def test_the_iterated_expert_forecasts_frame_by_frame() -> None:
     for frame in range(1, 400):
         steps[frame] += 0.6 * steps[frame - 1]
     rows = Rows.of([np.cumsum(steps, axis=0)] * 2, ["ann", "bob"])
-    expert = LinearExpert(4, 2, 0, adapts=False, iterated=True)
+    expert = LinearExpert(4, 2, 0, iterated=True)
     fit = fit_linear(expert, rows, np.array(HORIZONS))
     assert fit.precision is None
     once = fit_linear(expert, rows, np.array([1])).people[0] / fit.scale[:, None]  # (F, D)
@@ -309,7 +324,7 @@ def test_slow_means_begin_as_the_mean() -> None:
     series = np.arange(30.0)[:, None] * np.ones(SERIES)
     means = slow_means(series)
     for frame in range(10):  # of the shortest memory
-        expected = np.tile(series[: frame + 1].mean(axis=0), (3, 1))
+        expected = np.tile(series[: frame + 1].mean(axis=0), (len(SLOW), 1))
         np.testing.assert_allclose(means[frame], expected)
 
 

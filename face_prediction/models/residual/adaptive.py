@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from face_prediction.models.residual.experts import (
     EXPERTS,
@@ -27,7 +27,6 @@ from face_prediction.models.residual.experts import (
     SLOW,
     Floats,
     LinearExpert,
-    extrapolate,
     linear_features,
     slow_rates,
 )
@@ -35,7 +34,7 @@ from face_prediction.models.residual.experts import (
 ROBUST = 0.5
 """Share of the expected error below which the errors of rows count alike."""
 OVERLAP = 0.5
-"""Errors h frames ahead overlap with their neighbours': a row counts 1 / (1 + OVERLAP (h - 1))."""
+"""Errors h frames ahead overlap with their neighbours': each counts 1 / (1 + OVERLAP (h - 1))."""
 HORIZONS = (1, 2, 3, 4, 5, 8, 12, 18, 24)
 """Knots in frames ahead; between them the displacement is interpolated."""
 
@@ -55,12 +54,13 @@ class Band:
 
 BANDS = (Band(slice(0, 5), 2), Band(slice(5, 9), 6))
 """Up to 5 frames ahead as at 3, beyond as at 12."""
-SHARPNESS = 20.0
-"""An expert whose error is 1 + d times the best one's has exp(-SHARPNESS d) times its weight."""
-WEIGHT_MEMORY = 100.0
-"""Frames after which an error counts 1 / e in an expert's weight."""
-SIZE_MEMORY = 40.0
-"""Frames after which an error of the mixture counts 1 / e in the error that is expected of it."""
+SHARPNESS = 16.0
+"""An expert whose error one frame ahead is 1 + d times the best one's has exp(-SHARPNESS d) times
+its weight; further ahead as much less as a mean of overlapping errors is less certain."""
+LEARNT_MEMORY = 200.0
+"""Frames after which a row counts 1 / e in what an expert has learnt from a face."""
+ERROR_MEMORY = 40.0
+"""Frames after which an error counts 1 / e in what is expected of an expert, or of the mixture."""
 CALM = 2e-3
 """Face sides a frame: the motion of a mouth that is slower is mostly the detector's jitter."""
 MOST_CALM = 2.5
@@ -68,10 +68,7 @@ MOST_CALM = 2.5
 CAUTION = 0.8
 """Logarithm by which the error of an expert that adapts is assumed larger for each e-fold that the
 mouth is slower than `CALM`: coefficients learnt from a moving face are worth little once it comes
-to rest."""
-FAR_CAUTION = 0.4
-"""The same, beyond the first band of horizons, for the others but the iterated one, which is the
-best baseline: it is what the mixture falls back to."""
+to rest, and the iterated one, which is the best baseline, is what the mixture falls back to."""
 PROVEN = 70.0
 """Frames after which caution falls as 1 / frames."""
 PRIOR_ROWS = 20.0
@@ -92,7 +89,7 @@ class LinearFit:
         scale: (F,) standard deviation of the features.
         people: (H, F, D) coefficients of scaled features.
         precision: (2, F, F) inverse covariance of a person's coefficients about these, for each of
-            `BANDS`; None for an expert that does not adapt.
+            `BANDS`; None for the iterated expert, which does not adapt.
     """
 
     scale: Floats
@@ -106,7 +103,7 @@ class PeopleFit:
 
     Attributes:
         horizons: (H,) frames ahead.
-        linear: fits of the linear experts of `EXPERTS`, in their order.
+        linear: fits of `EXPERTS`, in their order.
         usual: (E + 1, H, 2) constant and slope of the logarithm of an expert's mean error over the
             pace of a face, by the logarithm of that pace over ``pace``; the last is the mixture.
         pace: median mean step of the mouth, in face sides.
@@ -140,7 +137,7 @@ class StateForecast:
         signs: (N, H, S) logarithms from which the size of the mouth's error is told, see
             `intervals`.
         experts: (N, E, H, D) forecasts of every expert.
-        features: (N, F) scaled, of every linear expert.
+        features: (N, F) scaled, of every expert.
     """
 
     moved: Floats
@@ -160,12 +157,11 @@ class Mixture:
     def __init__(self, fit: PeopleFit, faces: int) -> None:
         self.fit, self.frames = fit, 0
         knots, top = len(fit.horizons), int(fit.horizons[-1])
-        self._cautions = cautions(fit.horizons)
         self._steps = np.zeros(faces)
         self._errors = np.zeros((faces, len(EXPERTS), knots))
         self._mixed_errors = np.zeros((faces, knots))
         self._late_errors = np.zeros((faces, knots))
-        self._count, self._mixed_count, self._late_count = (np.zeros(knots) for _ in range(3))
+        self._count, self._late_count = np.zeros(knots), np.zeros(knots)
         self._moved = Ring(top, (faces, knots, 2))
         self._experts = Ring(top, (faces, len(EXPERTS), knots, 2))
 
@@ -192,8 +188,8 @@ class Mixture:
     def expected_errors(self) -> tuple[Floats, Floats]:
         """Mean errors so far of the experts (N, E, H) and of the mixture (N, H)."""
         usual = PRIOR_ROWS * self.fit.usual_errors(self.pace)
-        experts = (self._errors + usual[:, :-1]) / (self._count + PRIOR_ROWS)
-        return experts, (self._mixed_errors + usual[:, -1]) / (self._mixed_count + PRIOR_ROWS)
+        rows = self._count + PRIOR_ROWS
+        return (self._errors + usual[:, :-1]) / rows, (self._mixed_errors + usual[:, -1]) / rows
 
     def take(self, step: Floats) -> None:
         """Take in the next frame, in which the mouth moved by ``step`` (N,) on average."""
@@ -215,13 +211,14 @@ class Mixture:
         made = self._experts.of_horizons(ages, axis=1).swapaxes(1, 2)  # (N, K, E, 2)
         errors = np.abs(made - truth[:, :, None]).mean(axis=-1)
         mixed = np.abs(self.outcomes() - truth).mean(axis=-1)
-        for name, count, memory, error in (
-            ("_errors", "_count", WEIGHT_MEMORY, errors.swapaxes(1, 2)),
-            ("_mixed_errors", "_mixed_count", SIZE_MEMORY, mixed),
-            ("_late_errors", "_late_count", LATE_MEMORY, mixed),
+        for sums, memory, more in (
+            (self._errors, ERROR_MEMORY, errors.swapaxes(1, 2)),
+            (self._mixed_errors, ERROR_MEMORY, mixed),
+            (self._count, ERROR_MEMORY, 1),
+            (self._late_errors, LATE_MEMORY, mixed),
+            (self._late_count, LATE_MEMORY, 1),
         ):
-            for sums, more in ((getattr(self, name), error), (getattr(self, count), 1)):
-                sums[..., known] = np.exp(-1 / memory) * sums[..., known] + more
+            sums[..., known] = np.exp(-1 / memory) * sums[..., known] + more
         return errors
 
     def mix(self, experts: Floats, recent: Floats) -> tuple[Floats, Floats]:
@@ -237,7 +234,8 @@ class Mixture:
         errors, expected = self.expected_errors()
         speed = np.abs(np.diff(recent[:, -4:, :2], axis=1)).mean(axis=(1, 2)) + LEAST_PACE / 4
         cautious = errors * self._caution(speed)
-        share = np.exp(-SHARPNESS * (cautious / cautious.min(axis=1, keepdims=True) - 1))
+        sharpness = SHARPNESS / np.sqrt(overlap(self.fit.horizons))
+        share = np.exp(-sharpness * (cautious / cautious.min(axis=1, keepdims=True) - 1))
         share /= share.sum(axis=1, keepdims=True)  # (N, E, H)
         moved = np.einsum("neh,nehd->nhd", share, experts)
         apart = np.abs(experts[..., :2] - moved[:, None, :, :2]).mean(axis=-1)
@@ -256,9 +254,10 @@ class Mixture:
         self._experts.push(experts[..., :2])
 
     def _caution(self, speed: Floats) -> Floats:
-        """Factors (N, E, H) on the errors of the experts at a speed (N,) of the mouth."""
+        """Factors (N, E, 1) on the errors of the experts at a speed (N,) of the mouth."""
         calm = np.clip(np.log(CALM / speed), 0, MOST_CALM) * min(1.0, PROVEN / self.frames)
-        return np.exp(calm[:, None, None] * self._cautions)
+        caution = np.where([expert.iterated for expert in EXPERTS], 0.0, CAUTION)
+        return np.exp(calm[:, None] * caution)[..., None]
 
 
 class FaceState:
@@ -277,7 +276,7 @@ class FaceState:
         bands = [band for band in BANDS if band.knots.start < len(fit.horizons)]
         self._learners = [
             _Learner(expert, part, faces, bands, fit.horizons)
-            for expert, part in zip(_linear_experts(), fit.linear, strict=True)
+            for expert, part in zip(EXPERTS, fit.linear, strict=True)
         ]
 
     def keep(self, faces: int) -> None:
@@ -305,25 +304,19 @@ class FaceState:
         truth = self._recent[:, -1:] - self._recent[:, -1 - ages]
         errors = self.mixture.learn(truth[..., :2])
         expected = self.mixture.expected_errors()[1]
-        numbers = [n for n, expert in enumerate(EXPERTS) if isinstance(expert, LinearExpert)]
-        for number, learner in zip(numbers, self._learners, strict=True):
+        for number, learner in enumerate(self._learners):
             learner.learn(errors[..., number], expected, truth, ages)
 
     def forecast(self, recent: Floats | None = None) -> StateForecast:
         """Forecast from the newest frame, or from other ``recent`` frames (N, W, D)."""
         recent = self._recent[:, -RECENT:] if recent is None else recent
-        experts = np.empty((len(recent), len(EXPERTS), len(self.fit.horizons), SERIES))
-        features: list[Floats] = []
-        learners = iter(self._learners)
-        for number, expert in enumerate(EXPERTS):
-            if isinstance(expert, LinearExpert):
-                learner = next(learners)
-                features.append(learner.features(recent, self._slow))
-                experts[:, number] = learner.forecast(features[-1])
-            else:
-                experts[:, number] = extrapolate(expert, recent, self.fit.horizons)
+        features = tuple(learner.features(recent, self._slow) for learner in self._learners)
+        experts = np.stack(
+            [learner.forecast(own) for learner, own in zip(self._learners, features, strict=True)],
+            axis=1,
+        )
         moved, signs = self.mixture.mix(experts, recent)
-        return StateForecast(moved, signs, experts, tuple(features))
+        return StateForecast(moved, signs, experts, features)
 
     def remember(self, made: StateForecast) -> None:
         """Keep the forecast from the frame taken in last, to learn from its outcome."""
@@ -448,7 +441,7 @@ class _Learner:
         """
         if self.fit.precision is None:
             return
-        memory = np.exp(-1 / self.expert.memory)
+        memory = np.exp(-1 / LEARNT_MEMORY)
         for number, band in enumerate(self._bands):
             first, stop = band.knots.start, min(band.knots.stop, len(ages))
             if first >= stop:
@@ -476,30 +469,18 @@ LATE_MEMORY = 8.0
 """Frames after which an error counts 1 / e among the late ones, from which intervals are told."""
 
 
+def overlap(horizon: ArrayLike) -> Floats:
+    """Errors that count together as one, (...) for ``horizon`` (...) frames ahead."""
+    return 1 + OVERLAP * (np.asarray(horizon, dtype=np.float64) - 1)
+
+
 def row_weights(ratio: Floats, usual: Floats, horizon: int) -> Floats:
     """Weights (...) of rows whose error is ``ratio`` (...) times what was expected.
 
     Those of a Laplace density whose mean is ``usual`` (...) at ``horizon``, in the least-squares
     form of iterative reweighting; less for errors that overlap with their neighbours'.
     """
-    overlap = 1 + OVERLAP * (horizon - 1)
-    return 1 / (overlap * usual**2 * np.sqrt(ratio**2 + ROBUST**2))
-
-
-def _linear_experts() -> list[LinearExpert]:
-    return [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
-
-
-def cautions(horizons: NDArray[np.int64]) -> Floats:
-    """Caution (E, H) about each expert at each horizon."""
-    far = horizons > HORIZONS[BANDS[0].knots.stop - 1]
-    result = np.empty((len(EXPERTS), len(horizons)))
-    for number, expert in enumerate(EXPERTS):
-        if isinstance(expert, LinearExpert) and (expert.adapts or expert.iterated):
-            result[number] = CAUTION if expert.adapts else 0.0
-        else:
-            result[number] = np.where(far, FAR_CAUTION, 0.0)
-    return result
+    return 1 / (overlap(horizon) * usual**2 * np.sqrt(ratio**2 + ROBUST**2))
 
 
 def _pushed(past: Floats, newest: Floats) -> Floats:

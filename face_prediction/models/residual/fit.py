@@ -20,6 +20,7 @@ from face_prediction.forecast.interface import subject_folds
 from face_prediction.models.residual.adaptive import (
     BANDS,
     HORIZONS,
+    LEARNT_MEMORY,
     LEAST_PACE,
     MOST_PACE,
     LinearFit,
@@ -52,7 +53,7 @@ from robo_manip_baselines.runs.errors import RequestError
 
 _RIDGE = 3e-3  # share of the features' mean square added to the diagonal
 _ROUNDS = 4  # of reweighting from least squares to least absolute error
-_SMALL_ERROR = 1e-3  # face sides: errors below it count alike, of calm experts a tenth
+_SMALL_ERROR = 1e-3  # face sides: errors below it count alike
 _STILL = 1e-3  # face sides: a track with this mean step of the mouth counts half
 _STRIDE = 2  # frames between rows that are fitted to: neighbours are alike
 _WARM_UP = 10  # frames at the beginning of a track that are left out: they have no past
@@ -110,20 +111,19 @@ class Rows:
 
 
 def fit_people(tracks: Sequence[Floats], subjects: Sequence[str]) -> PeopleFit:
-    """Fit every linear expert to tracks (T, D) of people.
+    """Fit every expert to tracks (T, D) of people.
 
     All errors count as alike: `fit_residual` measures them.
     """
     rows, knots = Rows.of(tracks, subjects), np.array(HORIZONS)
-    experts = [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
-    linear = tuple(fit_linear(expert, rows, knots) for expert in experts)
+    linear = tuple(fit_linear(expert, rows, knots) for expert in EXPERTS)
     growth = np.log(np.tile(knots.astype(np.float64), (len(EXPERTS) + 1, 1)))
     usual = np.stack([growth, np.zeros_like(growth)], axis=-1)
     return PeopleFit(knots, linear, usual, float(np.median(rows.pace[rows.seen == 0])))
 
 
 def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) -> LinearFit:
-    """Fit one linear expert: scale, people's coefficients, and spread between people."""
+    """Fit one expert: scale, people's coefficients, and spread between people."""
     features = linear_features(expert, rows.recent, rows.slow)
     scale = features.std(axis=0) + 1e-9
     features = features / scale
@@ -137,15 +137,11 @@ def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) ->
         origins = rows.origins(horizon)
         x = features[origins]
         y = rows.series[origins + horizon] - rows.series[origins]
-        pace = rows.pace[origins]
-        weight = 1 / pace if expert.calm else pace / (pace + _STILL)
-        people[place] = least_absolute(x, y, weight, _SMALL_ERROR / (10 if expert.calm else 1))
-        if expert.adapts and place in usual:
+        people[place] = least_absolute(x, y, rows.pace[origins])
+        if place in usual:
             rest = (y - x @ people[place])[:, :2]
-            precision[usual.index(place)] = spread(
-                x, rest, rows.person[origins], horizon, expert.memory
-            )
-    return LinearFit(scale, people, precision if expert.adapts else None)
+            precision[usual.index(place)] = spread(x, rest, rows.person[origins], horizon)
+    return LinearFit(scale, people, precision)
 
 
 def iterated(
@@ -163,7 +159,7 @@ def iterated(
     origins = rows.origins(1)
     x = features[origins]
     y = rows.series[origins + 1] - rows.series[origins]
-    step = np.linalg.lstsq(x, y, rcond=None)[0]  # (F, D)
+    step = least_absolute(x, y, rows.pace[origins])  # (F, D)
     kept = len(expert.columns)
     onward = np.zeros((expert.size, expert.size))  # features of the next frame from these
     onward[kept:, :-kept] = np.diag(scale[kept:] / scale[:-kept])
@@ -178,17 +174,18 @@ def iterated(
     return moved
 
 
-def least_absolute(x: Floats, y: Floats, weight: Floats, small: float) -> Floats:
+def least_absolute(x: Floats, y: Floats, pace: Floats) -> Floats:
     """Coefficients (F, D) of the least absolute error of y's first two columns, the mouth.
 
-    Errors below ``small`` count alike.
+    Errors below `_SMALL_ERROR` count alike, and rows of tracks whose ``pace`` (N,) is far below
+    `_STILL` little.
     """
-    used = weight
+    weight = used = pace / (pace + _STILL)
     solution = np.zeros((x.shape[1], y.shape[1]))
     for iteration in range(_ROUNDS):
         if iteration:
             error = np.abs(y[:, :2] - x @ solution[:, :2]).mean(axis=1)
-            used = weight / np.sqrt(error**2 + small**2)
+            used = weight / np.sqrt(error**2 + _SMALL_ERROR**2)
             used = used / used.mean()
         weighted = x * used[:, None]
         gram = weighted.T @ x + _RIDGE * len(x) * np.eye(x.shape[1])
@@ -196,13 +193,11 @@ def least_absolute(x: Floats, y: Floats, weight: Floats, small: float) -> Floats
     return solution
 
 
-def spread(
-    x: Floats, missed: Floats, person: NDArray[np.int64], horizon: int, memory: float
-) -> Floats:
+def spread(x: Floats, missed: Floats, person: NDArray[np.int64], horizon: int) -> Floats:
     """Inverse covariance (F, F) between people of what corrects errors (N, 2) on features (N, F).
 
     Expectation maximisation of a hierarchical linear model. A person's rows count together as many
-    as a face's that has been watched for ``memory`` frames, weighted as `row_weights` does.
+    as a face's that has been watched for `LEARNT_MEMORY` frames, weighted as `row_weights` does.
     """
     grams: list[Floats] = []
     crosses: list[Floats] = []
@@ -213,7 +208,7 @@ def spread(
         error = np.abs(missed[own]).mean(axis=1)
         expected = max(float(error.mean()), LEAST_PACE)
         weight = row_weights(error / expected, np.full(len(own), expected), horizon)
-        weighted = x[own] * weight[:, None] * min(_STRIDE, memory / len(own))
+        weighted = x[own] * weight[:, None] * min(_STRIDE, LEARNT_MEMORY / len(own))
         grams.append(weighted.T @ x[own])
         crosses.append(weighted.T @ missed[own])
     size = x.shape[1]

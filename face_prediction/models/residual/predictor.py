@@ -29,7 +29,6 @@ from face_prediction.models.residual.experts import (
     SERIES,
     SHAPES,
     Floats,
-    LinearExpert,
 )
 from face_prediction.models.residual.intervals import (
     LEVELS,
@@ -111,7 +110,7 @@ class ResidualFit:
                 arrays[f"people_{index}"],
                 arrays.get(f"precision_{index}"),
             )
-            for index in range(len(_linear_experts()))
+            for index in range(len(EXPERTS))
         )
         people = PeopleFit(
             arrays["horizons"].astype(np.int64),
@@ -120,10 +119,6 @@ class ResidualFit:
             float(arrays["pace"][0]),
         )
         return cls(arrays["basis"], people, IntervalFit(arrays["size"], arrays["quantiles"]))
-
-
-def _linear_experts() -> list[LinearExpert]:
-    return [expert for expert in EXPERTS if isinstance(expert, LinearExpert)]
 
 
 def array_shapes(knots: int) -> dict[str, tuple[int, ...]]:
@@ -136,12 +131,12 @@ def array_shapes(knots: int) -> dict[str, tuple[int, ...]]:
         "size": (knots, 2, SIGNS + 1),
         "quantiles": (knots, 2, len(LEVELS)),
     }
-    for index, expert in enumerate(_linear_experts()):
+    for index, expert in enumerate(EXPERTS):
         shapes |= {
             f"scale_{index}": (expert.size,),
             f"people_{index}": (knots, expert.size, SERIES),
         }
-        if expert.adapts:
+        if not expert.iterated:
             shapes[f"precision_{index}"] = (len(BANDS), expert.size, expert.size)
     return shapes
 
