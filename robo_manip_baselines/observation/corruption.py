@@ -6,6 +6,7 @@ video frames, J detections at the detector's own rate, ... any shape of times.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -252,6 +253,16 @@ class DetectionTiming:
         held = np.minimum((found + 1) / FRAME_RATE, seen)
         return np.where(found < frame, held, seen), found
 
+    def seen_now(self, time: float) -> tuple[float, int]:
+        """Return what `seen_at` does of one moment; Python's numbers are faster one by one."""
+        seen = max(time - self.delay, 0.0)
+        if self.rate is not None:
+            detection = float(self.last_detection[_frame_now(seen, self.rate)]) / self.rate
+            return min(detection, seen), _frame_now(detection)
+        frame = _frame_now(seen)
+        found = int(self.last_found[frame])
+        return min((found + 1) / FRAME_RATE, seen) if found < frame else seen, found
+
 
 _Draws = tuple[Floats | None, DetectionTiming]
 """Random draws of an episode: errors (F, H, 3) m, world, or None; and the timing."""
@@ -295,10 +306,13 @@ class CorruptionPipeline:
         """
         self._append(state)
         time, position, *predicted = (known[: self._steps] for known in self._known)
-        frames = int(frame_of(time[-1])) + 1
+        now = float(time[-1])
+        frames = _frame_now(now) + 1
         if frames > len(self._draws[1].last_found):
             self._draws = self._draw(self._seed, 2 * frames)
         forecast = predicted[0] if predicted else None
+        if not self.past:
+            return self._report_now(self._draws, time, position, forecast, now)
         observed = self._observe_at(self._draws, time, position, forecast, time[-1:])
         past = None if observed.past is None else observed.past[0]
         return TargetObservation(observed.time[0], observed.position[0], past)
@@ -344,6 +358,42 @@ class CorruptionPipeline:
         part = part[:, None, None]
         mixed = (1.0 - part) * position[row] + part * position[after]
         observed = np.where(part > 0.0, mixed, position[row])  # a step itself: bit for bit
+        late = np.where(between, late, 0.0)
+        self._corrupt(observed, error, time, position, predicted, (row, late, error_frame))
+        return TargetObservation(seen, observed)
+
+    def _report_now(
+        self, draws: _Draws, time: Floats, position: Floats, predicted: Floats | None, now: float
+    ) -> TargetObservation:
+        """Return what `_report_at` does of one moment, to the same numbers, and faster."""
+        error, timing = draws
+        seen, error_frame = timing.seen_now(now)
+        row = int(time.searchsorted(seen + _TIME_ROUNDING, side="right")) - 1
+        late = seen - float(time[row])
+        if late > _TIME_ROUNDING:
+            after = min(row + 1, len(time) - 1)
+            part = late / float(time[after] - time[row])
+            observed = (1.0 - part) * position[row] + part * position[after]
+        else:
+            late, observed = 0.0, position[row].copy()
+        at = np.array([row]), np.array([late]), np.array([error_frame])
+        self._corrupt(observed[None], error, time, position, predicted, at)
+        return TargetObservation(np.asarray(seen), observed)
+
+    def _corrupt(
+        self,
+        observed: Floats,
+        error: Floats | None,
+        time: Floats,
+        position: Floats,
+        predicted: Floats | None,
+        at: tuple[NDArray[np.int64], Floats, NDArray[np.int64]],
+    ) -> None:
+        """Put errors or forecasts into observed targets (n, K, 3).
+
+        ``at`` are (n,) the step at which each was seen, the s after it, and the frame of its error.
+        """
+        row, late, error_frame = at
         if error is not None:
             ahead = min(error.shape[1], observed.shape[1] - 1)
             observed[:, 1 : ahead + 1] += error[error_frame, :ahead]
@@ -351,8 +401,7 @@ class CorruptionPipeline:
             if predicted is None:
                 raise ValueError("a forecaster's output is to be observed, and the state has none")
             made = np.concatenate([position[row, :1], predicted[row]], axis=1)
-            steps = np.where(between, late / FRAME_PERIOD, 0.0)
-            observed[:, 1:] = _read_off(made, steps, observed.shape[1])[:, 1:]
+            observed[:, 1:] = _read_off(made, late / FRAME_PERIOD, observed.shape[1])[:, 1:]
         elif self.corruption.error == "model":
             frames = 0 if predicted is None else predicted.shape[1]
             if problem := prediction_problem(frames, self.horizon):
@@ -362,7 +411,6 @@ class CorruptionPipeline:
             made = np.searchsorted(time, error_frame / FRAME_RATE - _TIME_ROUNDING)
             ahead = slice(1, min(frames + 1, position.shape[1]))
             observed[:, ahead] += predicted[made, : ahead.stop - 1] - position[made, ahead]
-        return TargetObservation(seen, observed)
 
     def _append(self, state: State) -> None:
         given = (state.time, state.target_position, state.predicted_target)
@@ -426,6 +474,11 @@ def prediction_problem(frames: int, horizon: int) -> str:
 def frame_of(time: ArrayLike, rate: float = FRAME_RATE) -> NDArray[np.int64]:
     """Return the number of the last frame, the first being 0, that was taken by ``time`` (s)."""
     return np.floor(np.asarray(time) * rate + _FRAME_ROUNDING).astype(np.int64)
+
+
+def _frame_now(time: float, rate: float = FRAME_RATE) -> int:
+    """Return what `frame_of` does of one time."""
+    return math.floor(time * rate + _FRAME_ROUNDING)
 
 
 def draw_lost(corruption: Corruption, rng: np.random.Generator, frames: int) -> NDArray[np.bool_]:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from robo_manip_baselines.policy.act.cameras import CameraEncoder
 from robo_manip_baselines.policy.act.config import ActConfig
+from robo_manip_baselines.policy.act.inference import Prediction
 from robo_manip_baselines.policy.act.resnet import (
     ResNet18,
     feature_size,
@@ -123,13 +124,14 @@ class Attention(nn.Module):
         """Return (B, L, D).
 
         Args:
-            query_BLD: queries, with their positions.
+            query_BLD: queries, with their positions; (1, L, D) where they are the same for all.
             key_BMD: keys, with their positions.
             value_BMD: values: the same tokens without.
             keep_BM: bool, False for tokens to mask out; None for no mask.
         """
         projected = self.query(query_BLD), self.key(key_BMD), self.value(value_BMD)
         heads = [x_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for x_BLD in projected]
+        heads[0] = heads[0].expand(len(key_BMD), -1, -1, -1)
         mask = None if keep_BM is None else keep_BM[:, None, None, :]
         attended_BGLE = nn.functional.scaled_dot_product_attention(*heads, attn_mask=mask)
         return self.out(attended_BGLE.transpose(1, 2).flatten(2))
@@ -252,7 +254,7 @@ class Decoder(nn.Module):
     def __init__(self, config: ActConfig, num_layers: int, num_run: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(DecoderLayer(config) for _ in range(num_layers))
-        self.num_run = num_run
+        self.num_run, self.dropout = num_run, config.dropout
         self.norm = LayerNorm(config.hidden_size)
         _initialize(self)
         # What is never run has no gradient, and distributed training waits for every gradient.
@@ -266,7 +268,10 @@ class Decoder(nn.Module):
             memory_BMD: tokens of the encoder.
             position_MD: their positions.
         """
-        x_BLD = query_LD.new_zeros((memory_BMD.shape[0], *query_LD.shape))
+        # Up to the first cross-attention all examples are the same but for what is dropped. One
+        # will do in training; predictions would round otherwise than those of earlier releases.
+        batch = 1 if self.training and self.dropout == 0.0 else len(memory_BMD)
+        x_BLD = query_LD.new_zeros((batch, *query_LD.shape))
         # The positions of the memory are the same in every layer: added once.
         memory_key_BMD = memory_BMD + position_MD
         for layer in self.layers[: self.num_run]:
@@ -349,6 +354,7 @@ class ActModel(PolicyModel):
         num_run = 1 if config.paper_compat else config.decoder_layers
         self.decoder = Decoder(config, config.decoder_layers, num_run)
         self.action_head = ExactLinear(width, config.actions_per_query * dims.action)
+        self.prediction: Prediction | None = None  # of a copy for inference
         if config.backbone_weights is not None:
             load_backbone(self.vision and self.vision.backbone, config.backbone_weights)
 
@@ -373,13 +379,16 @@ class ActModel(PolicyModel):
 
     def predict(self, state: Tensor, images: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return normalised actions (B, K, A) for the mean of the latent's prior, 0."""
+        if self.prediction is not None:
+            return self.prediction(state, images)
         return self._actions(state, images, None)
 
     def for_inference(self, dtype: torch.dtype) -> ActModel:
         """Return a copy that predicts the same, faster, and cannot be trained.
 
         Frozen normalisation is folded into the kernels once, and the weights are held in
-        ``dtype`` where autocast would cast all of them on every call: no autocast is needed.
+        ``dtype`` where autocast would cast all of them on every call: no autocast is needed. It is
+        moved to its device before it predicts, see `Prediction`.
 
         Args:
             dtype: of the matrix products: ``torch.float32`` or ``torch.bfloat16``; the layer
@@ -391,6 +400,7 @@ class ActModel(PolicyModel):
         for module in model.modules():
             if isinstance(module, Linear | nn.Conv2d):
                 module.to(dtype)
+        model.prediction = Prediction(model)
         return model.requires_grad_(False)
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, object]]:

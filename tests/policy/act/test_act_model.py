@@ -324,6 +324,29 @@ def test_it_starts_from_given_weights(make_model, tmp_path):
         make_model(BLIND, backbone_weights=str(path))
 
 
+@pytest.mark.parametrize("settings", [{}, {"pre_norm": True}, {"paper_compat": True}])
+def test_what_is_the_same_for_all_examples_is_trained_as_if_it_were_not(
+    make_model, make_batch, settings: dict[str, Any]
+):
+    """The decoder's first self-attention sees no observation: one example stands for all."""
+    batch, gradients, losses = make_batch(), [], []
+    for dropout in (0.0, 0.5):
+        model = make_model(**settings).train()
+        model.decoder.dropout = dropout  # as if something were dropped, so that every row counts
+        loss = model.loss(batch)["loss"]
+        loss.backward()
+        losses.append(loss.detach())
+        gradients.append({name: p.grad for name, p in model.named_parameters() if p.requires_grad})
+    torch.testing.assert_close(*losses)
+    for name, gradient in gradients[0].items():
+        assert gradient is not None
+        scale = gradient.abs().max().item()
+        # Rounding adds up over 16 channels and 18 tokens; some gradients are nothing but rounding.
+        torch.testing.assert_close(
+            gradient, gradients[1][name], rtol=1e-4, atol=1e-5 * scale + 1e-7, msg=name
+        )
+
+
 @pytest.mark.long
 def test_it_compiles_in_one_piece(make_model, make_batch):
     model, batch = make_model(), make_batch()

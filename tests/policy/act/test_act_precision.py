@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -52,3 +54,30 @@ def test_the_copy_for_inference_predicts_the_same(
     torch.testing.assert_close(found, expected, rtol=0.0, atol=tolerance * scale)
     assert not any(p.requires_grad for p in copied.parameters())
     assert all(torch.equal(value, model.state_dict()[name]) for name, value in state.items())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(
+    ("cameras", "settings"),
+    [
+        (0, {}),
+        (0, {"state_layers": 2, "actions_per_query": 4, "use_cvae": False, "decoder_layers": 1}),
+        (0, {"pre_norm": True, "paper_compat": True}),
+        (2, {"pre_norm": True}),
+        (2, {"vision": "small", "state_layers": 1}),
+    ],
+)
+def test_without_modules_a_prediction_is_the_same_bit_for_bit(
+    make_model, make_batch, cameras: int, settings: dict[str, Any], dtype: torch.dtype
+):
+    dims = PolicyDims(5, 3, cameras, (40, 70))
+    copied, batch = make_model(dims, **settings).for_inference(dtype), make_batch(dims)
+    shown = [
+        (batch.state[:rows] + shift, None if batch.images is None else batch.images[:rows])
+        for rows, shift in ((3, 0.0), (3, 1.0), (2, 0.0), (3, 2.0))
+    ]
+    found = [copied.predict(*observed, None) for observed in shown]
+    assert not torch.equal(found[0], found[1])
+    copied.prediction = None  # through the modules
+    for observed, actions in zip(shown, found, strict=True):
+        assert torch.equal(copied.predict(*observed, None), actions)

@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, FACE
 
@@ -70,6 +71,13 @@ _WALL: Final = 0.040
 """m from the middle of the face: the walls of the mouth, inside and outside."""
 
 
+_AROUND_EYES: Final = ("head", "cheeks", "nose", "forehead")
+"""Regions of geoms that reach to the eyes."""
+
+_BY_POINT: Final = (*_AROUND_EYES, "mouth")
+"""Regions of geoms for which the point decides where they are touched, see `_region_at`."""
+
+
 class FaceContact(NamedTuple):
     """Contact of one region with one toucher during a control step.
 
@@ -90,6 +98,43 @@ class FaceContact(NamedTuple):
     force: float
     impulse: float
     point: tuple[float, float, float]
+
+
+class _Touching(NamedTuple):
+    """Contact with the face, as far as its two geoms decide.
+
+    Attributes:
+        number: of the contact.
+        face: geom of the face.
+        region: None where the point decides.
+        toucher: as in `FaceContact`.
+        is_stopped: the outside of a face stops the other geom.
+        is_robot: and this is the outside.
+    """
+
+    number: int
+    face: int
+    region: str | None
+    toucher: str
+    is_stopped: bool
+    is_robot: bool
+
+
+class _InHead:
+    """Contact points of a physics step in the frame of the head, each made when it is asked for."""
+
+    def __init__(self, data: mujoco.MjData, head: int) -> None:
+        self._data, self._head = data, head
+        self._points: NDArray[np.float64] | None = None  # of all contacts, world
+
+    def point(self, number: int) -> tuple[float, float, float]:
+        """Return x, y, z in m of a contact."""
+        data, head = self._data, self._head
+        if self._points is None:
+            self._points = data.contact.pos
+            self._origin, self._axes = data.xpos[head], data.xmat[head].reshape(3, 3)
+        x, y, z = ((self._points[number] - self._origin) @ self._axes).tolist()
+        return x, y, z
 
 
 class FaceTouch:
@@ -131,7 +176,7 @@ class FaceTouch:
     def clear(self) -> None:
         """Begin a control step."""
         self.pairs: list[list[int]] = []
-        self._packed_pairs, self._touching = b"", list[int]()
+        self._packed_pairs, self._touching = b"", list[_Touching]()
         self.robot_force = 0.0
         self._found: dict[tuple[str, str, bool], FaceContact] = {}
 
@@ -142,38 +187,55 @@ class FaceTouch:
         if (packed := geoms.tobytes()) != self._packed_pairs:
             self._packed_pairs, self.pairs, is_face = packed, geoms.tolist(), self._is_face
             pairs = enumerate(self.pairs)
-            self._touching = [n for n, (a, b) in pairs if is_face[a] or is_face[b]]
+            self._touching = [
+                self._touch(n, a, b) for n, (a, b) in pairs if is_face[a] or is_face[b]
+            ]
         self.robot_force = 0.0
         if self._touching:
             self._measure(model, data, self._touching)
 
-    def _measure(self, model: mujoco.MjModel, data: mujoco.MjData, touching: list[int]) -> None:
-        wrench = np.zeros(6)
+    def _touch(self, number: int, first: int, second: int) -> _Touching:
+        face, other = (first, second) if self._is_face[first] else (second, first)
+        is_stopped, region = self._is_stopped[other], self._regions[face]
+        return _Touching(
+            number,
+            face,
+            None if region in _BY_POINT else region,
+            self._toucher[other],
+            is_stopped,
+            self._is_outside[face] and is_stopped,
+        )
+
+    def _measure(
+        self, model: mujoco.MjModel, data: mujoco.MjData, touching: list[_Touching]
+    ) -> None:
+        # Most contacts go on, softer than they have been, in a region that their geom is all of:
+        # then nobody asks for their points.
+        wrench, in_head = np.zeros(6), _InHead(data, self._head)
         total: dict[tuple[str, str, bool], float] = {}
-        hardest: dict[tuple[str, str, bool], tuple[float, tuple[float, float, float]]] = {}
-        for number in touching:
+        hardest: dict[tuple[str, str, bool], tuple[float, int]] = {}
+        for number, face, region, toucher, is_stopped, is_robot in touching:
             mujoco.mj_contactForce(model, data, number, wrench)
-            if (force := float(wrench[0])) <= 0.0:
+            if (force := wrench.item(0)) <= 0.0:
                 continue
-            first, second = self.pairs[number]
-            face, other = (first, second) if self._is_face[first] else (second, first)
-            if self._is_outside[face] and self._is_stopped[other]:
+            if is_robot:
                 self.robot_force = max(self.robot_force, force)
-            x, y, z = self._in_head(data, data.contact.pos[number]).tolist()
-            region = self._region_at(face, x, y, z)
-            is_food = region in _EATING and not self._is_stopped[other]
-            key = region, self._toucher[other], is_food
+            if region is None:
+                region = self._region_at(face, *in_head.point(number))
+            is_food = not is_stopped and region in _EATING
+            key = region, toucher, is_food
             total[key] = total.get(key, 0.0) + force
             if key not in hardest or force > hardest[key][0]:
-                hardest[key] = force, (x, y, z)
+                hardest[key] = force, number
         for key, force in total.items():
             before, impulse = self._found.get(key), force * self._dt
             if before is not None:
                 impulse += before.impulse
             if before is None or force > before.force:
-                self._found[key] = FaceContact(*key, force, impulse, hardest[key][1])
+                point = in_head.point(hardest[key][1])
+                self._found[key] = FaceContact(*key, force, impulse, point)
             else:
-                self._found[key] = before._replace(impulse=impulse)
+                self._found[key] = FaceContact(*key, before.force, impulse, before.point)
 
     @property
     def contacts(self) -> tuple[FaceContact, ...]:
@@ -192,16 +254,13 @@ class FaceTouch:
             impulse[place] += contact.impulse
         return {"region_force": force, "region_impulse": impulse}
 
-    def _in_head(self, data: mujoco.MjData, point: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        return (point - data.xpos[self._head]) @ data.xmat[self._head].reshape(3, 3)
-
     def _region_at(self, geom: int, x: float, y: float, z: float) -> str:
         """Return the region of a point of a geom, in the frame of the head.
 
         The geoms of the visual face are larger than its regions.
         """
         region = self._regions[geom]
-        if region in ("head", "cheeks", "nose", "forehead"):
+        if region in _AROUND_EYES:
             if np.linalg.norm(self._eyes - (x, y, z), axis=1).min() < EYE_REACH:
                 return "eyes"
             if region == "head" and x > 0.0:
