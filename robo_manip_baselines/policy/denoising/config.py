@@ -26,6 +26,9 @@ RESNET18_PARAMETERS = 11_200_000
 GROUPS = 8
 """Groups of each group normalisation (public Diffusion Policy: 8)."""
 
+Loss = Literal["l2", "l1"]
+"""Mean squared error, mean absolute error."""
+
 
 @dataclass(frozen=True)
 class DenoisingConfig:
@@ -71,7 +74,7 @@ class DenoisingConfig:
     chunk_size: Chunk = 16
     backbone: Literal["unet", "transformer", "perceptron"] = "unet"
     target: Literal["noise", "action"] = "noise"
-    loss: Literal["l2", "l1"] = "l2"
+    loss: Loss = "l2"
     n_obs_steps: Annotated[int, Interval(ge=1, le=64)] = 2
     channels: tuple[Width, ...] = (256, 512, 1024)
     kernel_size: Annotated[int, Interval(ge=1, le=63)] = 5

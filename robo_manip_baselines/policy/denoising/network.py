@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from robo_manip_baselines.policy.act.resnet import MEAN, STD, ResNet18
-from robo_manip_baselines.policy.denoising.config import GROUPS, DenoisingConfig
+from robo_manip_baselines.policy.denoising.config import GROUPS, DenoisingConfig, Loss
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel
 
 LONGEST_WAVE = 10_000.0
@@ -232,7 +231,8 @@ class DenoisingModel(PolicyModel):
         super().__init__()
         self.chunk_size, self.n_obs_steps = config.chunk_size, config.n_obs_steps
         self.action_size, self.max_guidance = dims.action, config.max_guidance
-        self.sampling_noise, self.error = config.sampling_noise, config.loss
+        self.sampling_noise = config.sampling_noise
+        self.error: Loss = config.loss
         self.strategies = ("rtc",)
         width = config.hidden_size
         self.vision = ImageEncoder(config.vision, config.keypoints) if dims.cameras else None
@@ -341,7 +341,7 @@ def filled(batch: Batch) -> Tensor:
     return torch.where(batch.is_pad[..., None], batch.action.gather(1, last), batch.action)
 
 
-def mean_error(found: Tensor, wanted: Tensor, batch: Batch, loss: Literal["l1", "l2"]) -> Tensor:
+def mean_error(found: Tensor, wanted: Tensor, batch: Batch, loss: Loss) -> Tensor:
     """Return the mean error over all steps of (B, K, A), with the weights of the batch."""
     difference = found - wanted
     error = batch.weighted(difference.abs() if loss == "l1" else difference.square())
