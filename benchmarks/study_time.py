@@ -40,8 +40,9 @@ prepare_pytorch()
 
 import torch  # noqa: E402
 
-from robo_manip_baselines.training.device import Processes  # noqa: E402
+from robo_manip_baselines.training.device import PHASES, Processes, StepTimer  # noqa: E402
 from robo_manip_baselines.training.setup import TrainSetup  # noqa: E402
+from robo_manip_baselines.training.step import TrainingStep  # noqa: E402
 from robo_manip_baselines.training.trainer import Trainer  # noqa: E402
 
 Parts = dict[str, list[float]]
@@ -111,6 +112,20 @@ class Meter:
         setattr(owner, name, timed)
 
 
+class Clock(StepTimer):
+    """Processor time at the end of each phase of a step.
+
+    Attributes:
+        marks: s, first the beginning of the step.
+    """
+
+    marks: list[float]
+
+    def mark(self, phase: str) -> None:
+        """Mark the end of a phase."""
+        self.marks.append(time.process_time())
+
+
 def time_evaluation(options: Options) -> tuple[Parts, float]:
     """Return s of each part a control step, mean and fastest, and the steps of an episode."""
     meter = Meter()
@@ -156,32 +171,26 @@ def time_training(options: Options) -> tuple[Parts, int, float]:
     config = parse_config([*words, "--logger", "none", "--device", "cpu"])
     config = replace(config, spec=plan.checkpoint.spec)
     begin = time.process_time()
-    setup = TrainSetup.load(config)
-    trainer = Trainer(setup, None, torch.device("cpu"), Processes())
+    setup, device = TrainSetup.load(config), torch.device("cpu")
+    trainer = Trainer(setup, None, device, Processes())
     start = time.process_time() - begin
-    state, settings = trainer.state, config.training
+    state, clock = trainer.state, Clock(device)
+    loss, clip_norm = state.model.loss, config.training.clip_norm
+    compute = TrainingStep(loss, state, autocast=None, clip_norm=clip_norm, timer=clock)
     state.model.train()
     rows: list[list[float]] = []
     for step in range(WARM_UP + options.train_steps):
-        marks = [time.process_time()]
+        clock.marks = [time.process_time()]
         batch = trainer.loader.batch(step)
-        marks.append(time.process_time())
-        loss = state.model.loss(batch)["loss"]
-        marks.append(time.process_time())
-        loss.backward()
-        marks.append(time.process_time())
-        if settings.clip_norm:
-            torch.nn.utils.clip_grad_norm_(state.trained, settings.clip_norm)
-        state.optimizer.step()
-        state.optimizer.zero_grad(set_to_none=True)
+        clock.mark("data")
+        compute(batch)
         if state.average:
             state.average.update(step)
-        marks.append(time.process_time())
-        rows.append(np.diff(marks).tolist())
+        clock.mark("optimizer")
+        rows.append(np.diff(clock.marks).tolist())
     times = np.array(rows[WARM_UP:])
-    names = ("batch", "forward", "backward", "optimizer")
     both = np.stack([times.mean(axis=0), np.percentile(times, SHARE, axis=0)], axis=1)
-    parts: Parts = dict(zip(names, both.tolist(), strict=True))
+    parts: Parts = dict(zip(PHASES, both.tolist(), strict=True))
     return parts, setup.total_steps, start
 
 
