@@ -74,9 +74,10 @@ class BenchmarkOptions:
     """Options of a benchmark.
 
     Attributes:
-        benchmark: Name of the benchmark: feeding, delay, foresight_policies; demo, of the
-            checkpoints that come with the package, without training; or foresight, a study without
-            policies that has options of its own (foresight --help).
+        benchmark: Name of the benchmark: feeding, delay, foresight_policies, foresight_horizons;
+            drinking, wiping, bimanual_feeding; demo, of the checkpoints that come with the package,
+            without training; or foresight, a study without policies that has options of its own
+            (foresight --help).
         preset: Size: cpu (without images), cpu_images (three cameras), paper (three cameras, a GPU)
             or smoke (three minutes).
         conditions: Names of conditions, with spaces or commas between them; those of the preset if

@@ -311,6 +311,7 @@ def test_the_conditions_ship_with_the_package() -> None:
         "demo.yaml",
         "drinking.yaml",
         "feeding.yaml",
+        "foresight_horizons.yaml",
         "foresight_policies.yaml",
         "wiping.yaml",
     }

@@ -80,6 +80,27 @@ def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> No
     assert len(file.choose(file.presets["smoke"])) == 3
 
 
+def test_the_conditions_of_foresight_horizons_are_a_grid_of_true_futures() -> None:
+    file = read_conditions(CONDITIONS / "foresight_horizons.yaml")
+    assert (file.headline, file.people) == ("success_strict", DrawnPeople("train", "test"))
+    assert {(c.policy, c.expert) for c in file.conditions} == {("Mlp", "servo")}
+    cells = []
+    for c in file.conditions:
+        corruption = c.spec.corruption
+        assert (corruption.error, corruption.prediction) == ("none", "truth")
+        horizon = c.spec.frames - 1
+        shown = f"h{horizon}" if horizon else "current"
+        assert c.name == f"{c.motion}_delay{corruption.delay}_{shown}"
+        cells.append((c.motion, corruption.delay, horizon))
+    assert cells == [
+        (motion, delay, horizon)
+        for motion in ("dyskinetic", "sway", "recorded")
+        for delay in (0, 4, 8)
+        for horizon in (0, 2, 5, 8, 12, 16, 24)
+    ]
+    assert len(file.choose(file.presets["smoke"])) == 3
+
+
 def test_the_conditions_of_the_presets_are_there() -> None:
     file = read_conditions(CONDITIONS / "feeding.yaml")
     assert {name: len(file.choose(names)) for name, names in file.presets.items()} == {
