@@ -16,7 +16,7 @@ from face_prediction.dataset.manifest import MANIFEST_NAME
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import KINDS
 from face_prediction.dataset.split import SplitName, split_dataset
-from face_prediction.dataset.tracks import dataset_stretches
+from face_prediction.dataset.tracks import FaceStretch, dataset_stretches
 from face_prediction.evaluation.figures import draw_gains, write_figures
 from face_prediction.evaluation.predictors import (
     UNFITTED,
@@ -82,6 +82,8 @@ class EvaluateOptions:
         split: person: nobody is forecast by what was trained on them. sequence: the paper's,
             windows that were not trained on, of people who were.
         tracks: also forecast whole tracks, from every frame, up to 24 frames ahead; by person only.
+        warm_up: frames at the beginning of each track that are not forecast from; None: so many
+            that the first forecast has seen as many frames as in a sequence (69).
         kinds: kinds of footage to report on, each by itself.
         out: folder for tables and figures.
         detector_model: MediaPipe's face_landmarker.task, for networks that forecast images only.
@@ -102,6 +104,7 @@ class EvaluateOptions:
     baselines_from: Path | None = None
     split: SplitName = "person"
     tracks: bool = True
+    warm_up: Annotated[int, Interval(ge=0, le=10**6)] | None = None
     kinds: tuple[str, ...] = KINDS
     out: Path = Path("results/faces")
     detector_model: Path | None = None
@@ -142,6 +145,14 @@ def _evaluate(options: EvaluateOptions) -> int:
         selection = select_sequences(
             dataset, folds, options.kinds, options.max_sequences, options.seed, split
         )
+        kinds = {row.kind for row in selection.rows}
+        settings = dataset.manifest.settings
+        warm_up = settings.history - 1 if options.warm_up is None else options.warm_up
+        stretches: list[FaceStretch] = []
+        if options.tracks and split.by == "person":
+            found = dataset_stretches(dataset, folds, max(settings.length, warm_up + 2))
+            if not (stretches := [stretch for stretch in found if stretch.kind in kinds]):
+                raise RequestError(f"--warm_up {warm_up}: no track is longer")
         names, more = baseline_names(options, split.parts)
         notes += more
         logger.info("fitting the baselines")
@@ -158,16 +169,15 @@ def _evaluate(options: EvaluateOptions) -> int:
         )
         partners = None
         if options.shuffle_images:
-            kinds, subjects = zip(*((row.kind, row.subject) for row in selection.rows), strict=True)
-            partners = shuffled_partners(kinds, subjects, options.seed)
+            of_rows = zip(*((row.kind, row.subject) for row in selection.rows), strict=True)
+            partners = shuffled_partners(*of_rows, options.seed)
         scores = score_forecasts(setup, options.progress)
         if partners is not None:
             score_shuffled_images(setup, scores, partners, options.progress)
-        found = {row.kind for row in selection.rows}
         summaries = tuple(
             summarise_kind(scores, kind, seed=options.seed, resamples=options.resamples)
             for kind in KINDS
-            if kind in found
+            if kind in kinds
         )
         option_record = {
             "seed": options.seed,
@@ -178,18 +188,16 @@ def _evaluate(options: EvaluateOptions) -> int:
         record = provenance(dataset, dataset_sha256, split, loaded, option_record)
         left_out = notes_on_selection(networks, folds, split, options.max_sequences)
         record["notes"] = [*notes, *left_out]
-        history = dataset.manifest.settings.history
         tracks: list[TrackScores] = []
-        if options.tracks and split.by == "person":
-            stretches = [s for s in dataset_stretches(dataset, folds) if s.kind in found]
+        if stretches:
             # not those of the setup: its persistence copies images, of which a track has none
             rows = [*baselines, *networks]
-            tracks = score_tracks(dataset.manifest, stretches, rows, options.progress)
-            record["tracks"] = tracks_record(tracks, options.resamples, options.seed)
-        write_evaluation_report(options.out, EvaluationReport(summaries, history, folds, record))
+            tracks = score_tracks(dataset.manifest, stretches, rows, warm_up, options.progress)
+            record["tracks"] = tracks_record(tracks, options.resamples, options.seed, warm_up)
+        write_evaluation_report(options.out, EvaluationReport(summaries, settings.history, folds, record))
         logger.info("%s: tables.md, table1.csv, table2.csv, results.json", options.out)
         if tracks:
-            write_tracks(options.out, tracks, options.resamples, options.seed)
+            write_tracks(options.out, tracks, options.resamples, options.seed, warm_up)
             logger.info("%s: tracks.md, people.csv", options.out)
         if options.figures:
             if tracks and networks:

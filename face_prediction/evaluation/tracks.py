@@ -48,6 +48,8 @@ GROUPS: dict[str, tuple[int, int]] = {
 FAR = list(GROUPS).index("3–5")
 """The group that the best baseline is chosen by, as in the paper's protocol."""
 NOMINAL = (0.5, 0.9)
+NONE = "–"
+"""Cell of a number that there is none for."""
 _HISTORIES = 64  # at once
 
 
@@ -127,14 +129,14 @@ def forecast_stretches(
 
 
 def track_errors(
-    made: TrackForecast, stretch: FaceStretch, settings: SequenceSettings
+    made: TrackForecast, stretch: FaceStretch, settings: SequenceSettings, warm_up: int
 ) -> tuple[Floats, Floats | None]:
     """Errors (N, H, 2) in crops after the warm-up, and levels of intervals that just reach them.
 
     NaN where the track has ended before.
     """
     mouth, horizon = mouth_centre(stretch.landmarks), made.mouth.shape[1]
-    first, last = settings.history - 1, len(stretch)
+    first, last = warm_up, len(stretch)
     errors = np.full((last - first, horizon, 2), np.nan)
     for ahead in range(1, horizon + 1):
         count = last - first - ahead
@@ -158,11 +160,19 @@ def score_tracks(
     manifest: Manifest,
     stretches: Sequence[FaceStretch],
     predictors: Sequence[EvaluatedPredictor],
+    warm_up: int,
     progress: bool = False,
 ) -> list[TrackScores]:
     """Score predictors that look at no images, on every stretch, by kind of footage and person.
 
     `PERSISTENCE` counts among them: it copies landmarks and images alike.
+
+    Args:
+        manifest: of the dataset.
+        stretches: of its tracks, each longer than the warm-up.
+        predictors: rows.
+        warm_up: frames at the beginning of each stretch that are not forecast from.
+        progress: show a bar.
     """
     settings = manifest.settings
     shown = [p for p in predictors if p.name == PERSISTENCE or not any(n.frames for n in p.needs)]
@@ -179,11 +189,11 @@ def score_tracks(
             forecasts = [forecast_stretches(p, own, settings.history) for p in shown]
             for number, stretch in enumerate(own):
                 person = subjects.index(stretch.subject)
-                frames[person] += len(stretch) - settings.history + 1
+                frames[person] += len(stretch) - warm_up
                 steps = smoothness(mouth_centre(stretch.landmarks))
                 smooth[person] += (len(stretch) * steps, len(stretch))
                 for row in range(len(shown)):
-                    missed, levels = track_errors(forecasts[row][number], stretch, settings)
+                    missed, levels = track_errors(forecasts[row][number], stretch, settings, warm_up)
                     size = np.abs(missed).mean(axis=-1)
                     for place, group in enumerate(groups):
                         errors[person, row, place] += np.nansum(size[:, group])
@@ -229,7 +239,8 @@ def differences(scores: TrackScores, resamples: int, seed: int) -> Floats:
     """Percent (3, R, G) by which each row's error differs from the best baseline's at each group.
 
     The first is the value, the others the bounds of its 95 % interval over people. The best
-    baseline of each group is taken, so that a row is never compared with a weak one.
+    baseline of each group is taken, so that a row is never compared with a weak one. NaN where no
+    forecast has an outcome.
     """
     _, roles = zip(*scores.rows, strict=True)
     baselines = [i for i, role in enumerate(roles) if role == "baseline"]
@@ -243,30 +254,45 @@ def differences(scores: TrackScores, resamples: int, seed: int) -> Floats:
     best = sums[0, baselines].argmin(axis=0)  # chosen once, on all people
     reference = np.stack([sums[:, baselines[b], g] for g, b in enumerate(best)], axis=-1)
     percent = 100 * (sums / np.maximum(reference[:, None], 1e-300) - 1)
+    percent[..., scores.counts.sum(axis=0) == 0] = np.nan
     return np.stack([percent[0], *np.quantile(percent[1:], (0.025, 0.975), axis=0)])
 
 
+def mean_errors(scores: TrackScores) -> Floats:
+    """Mean absolute errors (R, G) in crops; NaN where no forecast has an outcome."""
+    return scores.errors.sum(axis=0) / _outcomes(scores)
+
+
 def coverages(scores: TrackScores) -> Floats:
-    """Percent (R, G, 2) of U and V inside the intervals of `NOMINAL`; NaN without intervals."""
-    return 100 * scores.inside.sum(axis=0) / np.maximum(scores.counts.sum(axis=0), 1)[None, :, None]
+    """Percent (R, G, 2) of U and V inside the intervals of `NOMINAL`.
+
+    NaN without intervals, and where no forecast has an outcome.
+    """
+    return 100 * scores.inside.sum(axis=0) / _outcomes(scores)[:, None]
 
 
-def tracks_markdown(all_scores: Sequence[TrackScores], resamples: int, seed: int) -> str:
+def _outcomes(scores: TrackScores) -> Floats:
+    counts = scores.counts.sum(axis=0)
+    return np.where(counts > 0, counts, np.nan)
+
+
+def tracks_markdown(
+    all_scores: Sequence[TrackScores], resamples: int, seed: int, warm_up: int
+) -> str:
     """``tracks.md``: a section for each kind of footage."""
     parts = [
         "# Forecasts of whole tracks",
-        "Every frame of a face that has been watched for as many frames as a sequence's history is "
-        "forecast from, up to 24 frames ahead. Predictors that keep a state see the face's whole "
-        "past. Errors are the mean of abs dU and dV of the mouth centre, in crops. In brackets: "
-        "95 % intervals from resampling people.",
+        f"Every frame of a face but the first {warm_up} is forecast from, up to 24 frames ahead. "
+        "Predictors that keep a state see the face's whole past. Errors are the mean of abs dU and "
+        "dV of the mouth centre, in crops. In brackets: 95 % intervals from resampling people.",
     ]
     for scores in all_scores:
         people = f"{len(scores.subjects)} people, {int(scores.frames.sum())} forecasts"
         parts.append(f"## {scores.kind}: {people}")
         head = ["", *(f"{name} ahead" for name in GROUPS)]
-        means = scores.errors.sum(axis=0) / np.maximum(scores.counts.sum(axis=0), 1)
+        means = mean_errors(scores)
         rows = [
-            [name, *(f"{value:.4f}" for value in means[i])]
+            [name, *(_cell(value, ".4f") for value in means[i])]
             for i, (name, _) in enumerate(scores.rows)
         ]
         parts.append("\n".join(markdown_table(head, rows)))
@@ -278,7 +304,9 @@ def tracks_markdown(all_scores: Sequence[TrackScores], resamples: int, seed: int
                 [
                     scores.rows[i][0],
                     *(
-                        f"{value[i, g]:+.1f} % ({low[i, g]:+.1f} to {high[i, g]:+.1f})"
+                        NONE
+                        if np.isnan(value[i, g])
+                        else f"{value[i, g]:+.1f} % ({low[i, g]:+.1f} to {high[i, g]:+.1f})"
                         for g in range(len(GROUPS))
                     ),
                 ]
@@ -287,9 +315,9 @@ def tracks_markdown(all_scores: Sequence[TrackScores], resamples: int, seed: int
             parts.append("\n".join(markdown_table(head, rows)))
         covered = coverages(scores)
         rows = [
-            [f"{scores.rows[i][0]}, {nominal:.0%}", *(f"{v:.1f}" for v in covered[i, :, k])]
+            [f"{scores.rows[i][0]}, {nominal:.0%}", *(_cell(v, ".1f") for v in covered[i, :, k])]
             for i in range(len(scores.rows))
-            if np.isfinite(covered[i]).all()
+            if np.isfinite(covered[i]).any()
             for k, nominal in enumerate(NOMINAL)
         ]
         if rows:
@@ -303,6 +331,10 @@ def tracks_markdown(all_scores: Sequence[TrackScores], resamples: int, seed: int
     return "\n\n".join(parts) + "\n"
 
 
+def _cell(value: float, form: str) -> str:
+    return NONE if np.isnan(value) else format(value, form)
+
+
 def _person_rows(scores: TrackScores, networks: Sequence[int]) -> list[list[object]]:
     """Cells of the table of people."""
     rows: list[list[object]] = []
@@ -314,7 +346,7 @@ def _person_rows(scores: TrackScores, networks: Sequence[int]) -> list[list[obje
         gains = [100 * (scores.errors[person, i, FAR] / max(best, 1e-300) - 1) for i in networks]
         row += [f"{gain:+.1f} %" for gain in gains]
         shares = [100 * scores.inside[person, i, FAR, 1] / count for i in networks]
-        row += ["–" if np.isnan(share) else f"{share:.1f}" for share in shares]
+        row += [_cell(share, ".1f") for share in shares]
         rows.append(row)
     return rows
 
@@ -342,12 +374,16 @@ def people_csv(all_scores: Sequence[TrackScores]) -> str:
 
 
 def tracks_record(
-    all_scores: Sequence[TrackScores], resamples: int, seed: int
+    all_scores: Sequence[TrackScores], resamples: int, seed: int, warm_up: int
 ) -> Mapping[str, Any]:
     """The part ``tracks`` of ``results.json``."""
-    result: dict[str, Any] = {"horizon_groups": list(GROUPS.values()), "nominal": list(NOMINAL)}
+    result: dict[str, Any] = {
+        "horizon_groups": list(GROUPS.values()),
+        "nominal": list(NOMINAL),
+        "warm_up": warm_up,
+    }
     for scores in all_scores:
-        means = scores.errors.sum(axis=0) / np.maximum(scores.counts.sum(axis=0), 1)
+        means = mean_errors(scores)
         value, low, high = differences(scores, resamples, seed)
         covered = coverages(scores)
         result[scores.kind] = {
@@ -374,8 +410,8 @@ def _rounded(values: Floats) -> list[float | None]:
 
 
 def write_tracks(
-    folder: Path, all_scores: Sequence[TrackScores], resamples: int, seed: int
+    folder: Path, all_scores: Sequence[TrackScores], resamples: int, seed: int, warm_up: int
 ) -> None:
     """Write ``tracks.md`` and ``people.csv``, each whole or not at all."""
-    write_text(folder / "tracks.md", tracks_markdown(all_scores, resamples, seed))
+    write_text(folder / "tracks.md", tracks_markdown(all_scores, resamples, seed, warm_up))
     write_text(folder / "people.csv", people_csv(all_scores))

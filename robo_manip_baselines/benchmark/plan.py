@@ -105,11 +105,11 @@ PRESETS: dict[str, BenchmarkPreset] = {
         train_preset="cpu_images",
         cameras=CAMERAS,
         image_size=(240, 320),
-        demonstrations=50,
+        demonstrations=150,
         demonstration_block=10,
         num_episodes=100,
         episode_block=25,
-        seconds={"demonstrations": 9.0, "training": 1500.0, "evaluation": 4.0, "video": 40.0},
+        seconds={"demonstrations": 5.0, "training": 1500.0, "evaluation": 4.0, "video": 40.0},
     ),
     # The paper's setting (Table III, section IV.C): three cameras, 50 demonstrations, 50 episodes.
     "paper": BenchmarkPreset(

@@ -346,6 +346,18 @@ def test_student_t_has_the_quantiles_it_is_made_of() -> None:
         assert float(scale) == pytest.approx(0.02, rel=0.01)
 
 
+def test_far_ahead_quantiles_follow_more_slowly() -> None:
+    fit = IntervalFit(np.zeros((2, 2, 5)), np.zeros((2, 2, 2)))
+    tracker = IntervalTracker(fit, 1, 5)
+    for _ in range(5):
+        tracker.remember(np.zeros((1, 2, 4)))
+    before, _ = tracker.student_t(np.zeros((1, 2, 4)))
+    tracker.learn(np.ones((1, 2, 2)), np.array([1, 5]))  # larger than both quantiles
+    after, _ = tracker.student_t(np.zeros((1, 2, 4)))
+    near, far = np.log(after / before)[0, :, 0]
+    assert near == pytest.approx(5 * far, rel=0.02)
+
+
 def test_quantiles_follow_a_face_that_errs_more() -> None:
     fit = IntervalFit(np.zeros((1, 2, 5)), np.log(np.tile([0.01, 0.03], (1, 2, 1))))
     tracker = IntervalTracker(fit, 1, 1)

@@ -25,9 +25,9 @@ SIGNS = 4
 LEVELS = (0.5, 0.9)
 """Q nominal coverages that are measured and followed; a Student-t density through both gives the
 others."""
-RATE = 0.02
-"""Change of the logarithm of a quantile with each outcome: a face that errs twice as much as the
-others is known after some two seconds."""
+RATE = 0.2
+"""Change of the logarithm of a quantile with each outcome one frame ahead; h frames ahead, where
+neighbouring outcomes overlap and come late, an h-th of it."""
 _LEAST_ERROR = 1e-5  # face sides, added to errors before their logarithm is taken
 _FREEDOM = np.geomspace(1.05, 60.0, 40)
 
@@ -94,7 +94,8 @@ class IntervalTracker:
         made = self._past.of_horizons(ages)  # (N, K, 2)
         ratio = np.log(np.abs(errors) + _LEAST_ERROR) - made
         exceeds = ratio[..., None] > self._quantiles[:, known]
-        self._quantiles[:, known] += RATE * (exceeds - (1 - np.array(LEVELS)))
+        rates = (RATE / ages)[:, None, None]
+        self._quantiles[:, known] += rates * (exceeds - (1 - np.array(LEVELS)))
 
     def remember(self, signs: Floats) -> None:
         """Keep the sizes told with a forecast, to learn from its outcome."""

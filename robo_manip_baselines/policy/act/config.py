@@ -154,7 +154,7 @@ PRESETS = {
     ),
     "cpu_images": PolicyPreset(
         config=replace(_SMALL, vision="small"),
-        training=replace(IMAGE_TRAINING, batch_size=16, steps=12000),
+        training=replace(IMAGE_TRAINING, batch_size=16, steps=30000),
         # Images are drawn and encoded for every tenth step only.
         execution=ActionExecution(temporal_ensemble=False, n_action_steps=10),
         image_size=(96, 128),

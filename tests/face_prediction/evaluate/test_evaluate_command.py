@@ -12,6 +12,7 @@ from face_prediction.commands import cli
 from face_prediction.commands.evaluate import EvaluateOptions
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.split import split_dataset
+from face_prediction.dataset.tracks import dataset_stretches
 from face_prediction.evaluation import predictors
 from face_prediction.forecast import Forecaster, LandmarkSequences
 from face_prediction.forecast.interface import mouth_centre
@@ -46,6 +47,25 @@ def test_baselines_alone(dataset: Path, tmp_path: Path, capsys) -> None:
     assert "| persistence | 0.0" in capsys.readouterr().out
     # whole tracks have the copy of the last frame, too, which copies no image there
     assert [row["name"] for row in record["tracks"]["natural"]["rows"]] == list(rows)
+
+
+def test_a_shorter_warm_up_forecasts_from_more_frames(dataset: Path, tmp_path: Path) -> None:
+    only = {"baselines": ("constant_velocity",), "max_sequences": 2, "resamples": 2}
+    found = [
+        run(dataset, tmp_path / str(warm_up), **only, warm_up=warm_up)["tracks"]
+        for warm_up in (None, 7, 3, 20)
+    ]
+    assert [tracks["warm_up"] for tracks in found] == [7, 7, 3, 20]  # a history has 8 frames
+    assert found[0] == found[1]
+    with FaceDataset(dataset) as opened:
+        clips = [s for s in dataset_stretches(opened) if s.kind == "natural"]
+    more = found[2]["natural"]["forecasts"] - found[0]["natural"]["forecasts"]
+    assert more == 4 * len(clips)
+    for row in found[3]["natural"]["rows"]:  # of 33 frames none has an outcome 18 ahead
+        for key in ("mean_abs", "difference"):
+            assert [value is None for value in row[key]] == [False] * 4 + [True] * 2
+    text = (tmp_path / "3" / "tracks.md").read_text()
+    assert "Every frame of a face but the first 3 is forecast from" in text
 
 
 def test_windows_of_people_who_were_trained_on(dataset: Path, tmp_path: Path, monkeypatch) -> None:

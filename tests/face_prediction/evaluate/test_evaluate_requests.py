@@ -35,6 +35,7 @@ pytestmark = pytest.mark.long
         ((), {"kinds": ("grid",)}, "no sequence of kind grid"),
         ((), {"baselines": ("best",)}, "unknown baseline 'best'; valid: ar_landmarks, "),
         ((), {"seed": -1}, "--seed -1: must be 0 to"),
+        ((), {"warm_up": 500}, "--warm_up 500: no track is longer"),
         ((), {"max_sequences": 1}, "--max_sequences 1: must be 2 to 1000000000"),
         ((), {"detector_model": Path("absent.task")}, "--detector_model absent.task: no such"),
     ],
