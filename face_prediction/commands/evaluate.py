@@ -194,7 +194,9 @@ def _evaluate(options: EvaluateOptions) -> int:
             rows = [*baselines, *networks]
             tracks = score_tracks(dataset.manifest, stretches, rows, warm_up, options.progress)
             record["tracks"] = tracks_record(tracks, options.resamples, options.seed, warm_up)
-        write_evaluation_report(options.out, EvaluationReport(summaries, settings.history, folds, record))
+        write_evaluation_report(
+            options.out, EvaluationReport(summaries, settings.history, folds, record)
+        )
         logger.info("%s: tables.md, table1.csv, table2.csv, results.json", options.out)
         if tracks:
             write_tracks(options.out, tracks, options.resamples, options.seed, warm_up)

@@ -193,7 +193,9 @@ def score_tracks(
                 steps = smoothness(mouth_centre(stretch.landmarks))
                 smooth[person] += (len(stretch) * steps, len(stretch))
                 for row in range(len(shown)):
-                    missed, levels = track_errors(forecasts[row][number], stretch, settings, warm_up)
+                    missed, levels = track_errors(
+                        forecasts[row][number], stretch, settings, warm_up
+                    )
                     size = np.abs(missed).mean(axis=-1)
                     for place, group in enumerate(groups):
                         errors[person, row, place] += np.nansum(size[:, group])

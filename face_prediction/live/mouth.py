@@ -1,8 +1,9 @@
 """The mouth in metres, now and in the next frames, from the images of a camera that is known.
 
-The lips are found in each image, forecast by the shipped predictor, and lifted: across by the rays
-of their pixels, along by the size of the head, that of MediaPipe's canonical face, or by a depth
-image. Camera frame: x right in the image, y up, the camera looks along -z; metres.
+The lips are found in each image, put back on the head where something hides them, forecast by the
+shipped predictor, and lifted: across by the rays of their pixels, along by the size of the head,
+that of MediaPipe's canonical face, or by a depth image. Camera frame: x right in the image, y up,
+the camera looks along -z; metres.
 
 Legend: H horizon, L = 468 landmarks.
 """
@@ -24,6 +25,7 @@ from face_prediction.tracking.extract import MAX_GAP
 from face_prediction.tracking.geometry import (
     CANONICAL_MOUTH,
     CENTIMETRE,
+    LIPS,
     RIGID_LANDMARKS,
     image_rays,
     read_canonical_face,
@@ -60,6 +62,20 @@ LIP_IMAGES = 30
 LEAST_RIGID, LEAST_LIPS = 8, 19
 """Landmarks, of 25 and of 20, that must be within: the nose hides some of the former, and of the
 latter, which lie at different depths, the mean must not lean to one side."""
+
+ANCHOR = (6, 119, 121, 133, 348, 350, 362)
+"""Rigid landmarks about the bridge of the nose. What hides the mouth draws the lips towards it, by
+11 mm, and these by 4 (16 approaches of the gripper in ``front_close``)."""
+
+LIP_SHIFT = 0.006
+"""m by which the lips may move on the head in earnest, by speech and the jaw. Farther away they are
+taken for hidden, from half of it on in part."""
+
+LIP_MEMORY = 90
+"""Images, 3 s of them, over which the place of the lips on the head is averaged."""
+
+TURN_MEMORY = 0.3
+"""s, time constant of the mean of the head's turn, which what hides the lips disturbs, too."""
 
 # fmt: off
 OUTER_LIPS = (
@@ -130,6 +146,76 @@ def agreed_excess(
     return float(excess[ours].mean() if share is None else np.quantile(excess[ours], share))
 
 
+class LipMemory:
+    """Place of the lips on the head, which remains while something hides them.
+
+    A detector that does not see lips makes them up, near the edge of what hides them. The
+    upper part of the face it still sees, and the lips are where they have been on it. What
+    lasts is believed after some seconds: a mouth may have opened wide.
+    """
+
+    def __init__(self) -> None:
+        self._place = np.zeros(3)
+        self._images = 0
+        self._turn, self._seen = np.eye(3), -math.inf
+
+    def restore(
+        self,
+        points: NDArray[np.floating],
+        turn: Floats,
+        distance: float,
+        time: float,
+        image_size: Size,
+        fov: float,
+    ) -> NDArray[np.floating]:
+        """Return landmarks with the lips where they are on the head, if they seem to be elsewhere.
+
+        Args:
+            points: (L, 2 or 3) normalised image coordinates.
+            turn: (3, 3) camera from head.
+            distance: m along the view.
+            time: s, later than that of the image before.
+            image_size: pixels.
+            fov: degrees, vertical.
+        """
+        turn = self._averaged(turn, time)
+        anchor, lips = (
+            image_rays(points[list(chosen), :2], image_size, fov).mean(axis=0) * distance
+            for chosen in (ANCHOR, LIPS)
+        )
+        place = turn.T @ (lips - anchor)
+        if self._images == 0:
+            self._place = place
+        shift = place - self._place
+        size = math.sqrt(shift @ shift)
+        if size < LIP_SHIFT:
+            self._images = min(self._images + 1, LIP_MEMORY)
+            self._place = self._place + shift / self._images
+        else:
+            self._place = self._place + shift * (LIP_SHIFT / size / LIP_MEMORY)
+        doubt = min(max(2.0 * size / LIP_SHIFT - 1.0, 0.0), 1.0)
+        if not doubt:
+            return points
+        restored = lips - doubt * (turn @ shift)
+        across = restored[:2] / -restored[2] - lips[:2] / -lips[2]
+        points = points.copy()
+        points[list(LIPS), :2] += across * (1.0, -1.0) / view_size(image_size, fov)
+        return points
+
+    def _averaged(self, turn: Floats, time: float) -> Floats:
+        """Mean of the turns so far, the later ones weighing more; anew after a gap."""
+        import cv2
+
+        gap, self._seen = time - self._seen, time
+        if gap > MAX_GAP:
+            self._turn = turn
+        else:
+            step = cv2.Rodrigues(turn @ self._turn.T)[0]
+            weight = 1.0 - math.exp(-gap / TURN_MEMORY)
+            self._turn = cv2.Rodrigues(weight * step)[0] @ self._turn
+        return self._turn
+
+
 class Forecaster(Protocol):
     """Source of forecasts, a `StreamingPredictor`."""
 
@@ -172,6 +258,7 @@ class MouthTracker:
         self._distance: float | None = None
         self._seen, self._count = -math.inf, 0
         self._lips, self._lip_images = 0.0, 0
+        self._memory = LipMemory()
 
     def update(
         self, image: NDArray[np.uint8], time: float, depth: NDArray[np.floating] | None = None
@@ -187,16 +274,20 @@ class MouthTracker:
             (H + 1, 3) m, camera frame; None where no face was found.
         """
         landmarks = self._find(image, time)
+        size, distance = (image.shape[1], image.shape[0]), 0.0
+        if landmarks is not None:
+            pose = head_pose_of_points(landmarks, size, self._fov)
+            distance = -float((pose[:3, :3] @ CANONICAL_MOUTH + pose[:3, 3])[2])
+            if depth is not None:
+                distance = self._measured(landmarks[:, :2], pose, distance, depth)
+            distance = self._smoothed(distance, time)
+            turn = pose[:3, :3]
+            landmarks = self._memory.restore(landmarks, turn, distance, time, size, self._fov)
         forecast = self._forecaster.update(time, landmarks, image)
         if landmarks is None or forecast is None:
             return None
-        size = (image.shape[1], image.shape[0])
-        pose = head_pose_of_points(landmarks, size, self._fov)
-        distance = -float((pose[:3, :3] @ CANONICAL_MOUTH + pose[:3, 3])[2])
-        if depth is not None:
-            distance = self._measured(landmarks[:, :2], pose, distance, depth)
         track = np.vstack([mouth_centre(landmarks)[None], mouth_centre(forecast.landmarks)])
-        return image_rays(track, size, self._fov) * self._smoothed(distance, time)
+        return image_rays(track, size, self._fov) * distance
 
     def _measured(
         self,

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from face_prediction.live.mouth import (
+    LIP_SHIFT,
     OUTER_LIPS,
     MouthTracker,
     agreed_excess,
@@ -197,3 +198,66 @@ def test_a_reset_begins_with_another_face() -> None:
     tracker.reset()
     assert faces.begun == 2
     assert drift.times == []
+
+
+def drawn(points: NDArray[np.float64], across: float, up: float = 0.0) -> NDArray[np.float64]:
+    """Landmarks with lips that are elsewhere by so many m."""
+    width, height = view_size(SIZE, FOV)
+    moved = points.copy()
+    moved[list(LIPS), :2] += np.array([across / width, -up / height]) / -mouth(pose())[2]
+    return moved
+
+
+def across(tracker: MouthTracker, images: int, start: int = 0) -> NDArray[np.float64]:
+    """Places (T, 2) m of the mouth across the view in so many images, from the true one."""
+    found = [tracker.update(IMAGE, number / 30) for number in range(start, start + images)]
+    places = np.array([own[0] for own in found if own is not None])
+    return (places - mouth(pose()))[:, :2]
+
+
+@pytest.mark.parametrize("turn", [-0.4, 0.0, 0.4])
+def test_lips_that_are_drawn_aside_are_where_they_were(turn: float) -> None:
+    where = pose(turn)
+    plain = seen(head(), where)
+    tracker, _, _ = track(*[plain] * 30, *[drawn(plain, 0.012, 0.008)] * 30)
+    found = [tracker.update(IMAGE, number / 30) for number in range(60)]
+    wrong = np.array([own[0] for own in found if own is not None]) - mouth(where)
+    assert len(wrong) == 60
+    assert np.abs(wrong[:30]).max() < 2e-4
+    assert np.linalg.norm(wrong[30, :2]) < 3e-4
+    assert np.linalg.norm(wrong[-1, :2]) < 3e-3  # a second later
+
+
+def test_a_head_that_moves_takes_hidden_lips_along() -> None:
+    where = pose(at=AWAY + np.array([0.03, 0.0, 0.0]))
+    before, after = seen(head(), pose()), seen(head(), where)
+    tracker, _, _ = track(*[before] * 30, drawn(after, 0.02))
+    for number in range(30):
+        tracker.update(IMAGE, number / 30)
+    found = tracker.update(IMAGE, 1.0)
+    assert found is not None
+    np.testing.assert_allclose(found[0, :2], mouth(where)[:2], atol=1e-3)
+
+
+def test_lips_that_move_a_little_are_believed() -> None:
+    plain = seen(head(), pose())
+    tracker, _, _ = track(*[plain] * 30, drawn(plain, 0.4 * LIP_SHIFT))
+    across(tracker, 30)
+    moved = across(tracker, 1, start=30)
+    assert moved[0, 0] == pytest.approx(0.4 * LIP_SHIFT, abs=3e-4)
+
+
+def test_what_lasts_is_believed_in_the_end() -> None:
+    plain = seen(head(), pose())
+    tracker, _, _ = track(*[plain] * 30, *[drawn(plain, 0.0, -0.01)] * 200)
+    places = across(tracker, 230)
+    assert abs(places[30, 1]) < 5e-4
+    assert places[-1, 1] == pytest.approx(-0.01, abs=1e-3)
+
+
+def test_a_reset_forgets_where_the_lips_were() -> None:
+    plain = seen(head(), pose())
+    tracker, _, _ = track(*[plain] * 30, drawn(plain, 0.02))
+    across(tracker, 30)
+    tracker.reset()
+    assert across(tracker, 1)[0, 0] == pytest.approx(0.02, abs=5e-4)
