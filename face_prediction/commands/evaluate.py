@@ -169,7 +169,7 @@ def _evaluate(options: EvaluateOptions) -> int:
         )
         partners = None
         if options.shuffle_images:
-            of_rows = zip(*((row.kind, row.subject) for row in selection.rows), strict=True)
+            of_rows = [row.kind for row in selection.rows], [row.subject for row in selection.rows]
             partners = shuffled_partners(*of_rows, options.seed)
         scores = score_forecasts(setup, options.progress)
         if partners is not None:
