@@ -359,7 +359,7 @@ def test_far_ahead_quantiles_follow_more_slowly() -> None:
 
 
 def test_quantiles_follow_a_face_that_errs_more() -> None:
-    """The quantiles waver, and hold in the mean what was promised: after 40 errors, and on and on."""
+    """The quantiles waver, and hold in the mean what was promised, from the 40th error on."""
     fit = IntervalFit(np.zeros((1, 2, 5)), np.log(np.tile([0.01, 0.03], (1, 2, 1))))
     tracker = IntervalTracker(fit, 1, 1)
     rng = np.random.default_rng(0)
