@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import tyro
 from annotated_types import Interval
@@ -83,7 +83,7 @@ class PolicyOptions:
         strategy: Execution of chunks: synchronous, naive, ensemble, rtc, rtc_trained or
             roll_forward; that of the checkpoint if not given.
         inference_delay: Control steps between an observation and the first action that is made
-            from it.
+            from it; or measured: as many as a prediction takes on this machine.
         device: Device of the network: auto, cpu, cuda or cuda:1.
         precision: fp32, or bf16 for the products inside the network.
         video: Videos to write: of the first successes and the first failures, half of each.
@@ -96,7 +96,7 @@ class PolicyOptions:
     temporal_ensemble: bool = False
     n_action_steps: Annotated[Chunk | None, tyro.conf.arg(aliases=["--execute"])] = None
     strategy: str | None = None
-    inference_delay: Delay = 0
+    inference_delay: Delay | Literal["measured"] = 0
     device: str = "auto"
     precision: str = "fp32"
     video: NonNegativeInt = 0

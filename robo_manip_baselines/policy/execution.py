@@ -8,6 +8,7 @@ Every environment is at a step of its own; its actions depend on its own episode
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,6 +28,9 @@ from robo_manip_baselines.runs.seeds import derive_seed
 
 EnvIds = NDArray[np.intp]
 """(b,) numbers of environments, all different."""
+
+WARM_UP = 3
+"""Predictions before those that are timed."""
 
 
 class TemporalEnsemble:
@@ -354,6 +358,24 @@ class PolicyRunner:
         """Start episodes of these seeds, (b,), in these environments."""
         self._buffer.reset(env_ids)
         self._seeds[env_ids], self._steps[env_ids] = seeds, 0
+
+    def prediction_time(self, repeats: int = 20) -> float:
+        """Return the s on the clock that a prediction takes, the median of several.
+
+        What was kept of the first environment's episode is forgotten.
+        """
+        env, vectors = np.array([0]), np.zeros((1, self._states.shape[2]), np.float32)
+        images = np.zeros((1, *self._images.shape[2:]), np.uint8) if self._has_images else None
+        self.reset(env, [0])
+        times: list[float] = []
+        while len(times) < repeats + WARM_UP:
+            is_due = self._buffer.steps_to_prediction(env)[0] == 0
+            begun = time.perf_counter()
+            self.act(vectors, images, env)  # ends with actions in memory, also of a GPU
+            if is_due:
+                times.append(time.perf_counter() - begun)
+        self.reset(env, [0])
+        return float(np.median(times[WARM_UP:]))
 
     def needs_images(self, env_ids: EnvIds) -> NDArray[np.bool_]:
         """Return (b,) whether the next observation's images enter a prediction."""

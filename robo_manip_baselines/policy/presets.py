@@ -37,6 +37,8 @@ MAX_CHUNK = 10_000
 
 Chunk = Annotated[int, Interval(ge=1, le=MAX_CHUNK)]
 Delay = Annotated[int, Interval(ge=0, le=MAX_CHUNK)]
+MEASURED = "measured"
+"""Delay of as many control steps as a prediction takes on this machine."""
 Width = Annotated[int, Interval(ge=1, le=65536)]
 Layers = Annotated[int, Interval(ge=1, le=256)]
 

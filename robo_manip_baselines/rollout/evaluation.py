@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval
 
@@ -30,18 +30,25 @@ from robo_manip_baselines.policy.checkpoint import (
     read_checkpoint,
     without_initial_weights,
 )
-from robo_manip_baselines.policy.presets import STRATEGIES, ActionExecution, Chunk, Delay
+from robo_manip_baselines.policy.presets import (
+    MEASURED,
+    STRATEGIES,
+    ActionExecution,
+    Chunk,
+    Delay,
+)
 from robo_manip_baselines.rollout.agreement import require_continuation
 from robo_manip_baselines.rollout.results import (
     SUMMARY,
     EpisodeResult,
     EvaluationSummary,
     open_results,
+    recorded_settings,
     require_evaluation_folder,
     require_seeds,
     summarize,
 )
-from robo_manip_baselines.rollout.rollout import ActingPolicy, Recording, rollout
+from robo_manip_baselines.rollout.rollout import Recording, rollout
 from robo_manip_baselines.rollout.videos import pick_for_video, video_name, write_video
 from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
@@ -56,6 +63,7 @@ from robo_manip_baselines.training.requirements import prepare_pytorch
 if TYPE_CHECKING:
     import torch
 
+    from robo_manip_baselines.policy.execution import PolicyRunner
     from robo_manip_baselines.policy.interface import PolicyModel
 
 logger = logging.getLogger(__name__)
@@ -93,7 +101,7 @@ class EvaluationConfig:
             number of the checkpoint; None otherwise.
         strategy: one of ``STRATEGIES`` to execute chunks with; that of the checkpoint if None.
         inference_delay: control steps between an observation and the first action that is made
-            from it.
+            from it; or ``measured``: as many as a prediction takes on this machine.
         num_envs: episodes that run at once; results do not depend on it.
         workers: processes in which environments step; 0 steps them in this one.
         device: of the network: auto, cpu, cuda or cuda:NUMBER.
@@ -115,7 +123,7 @@ class EvaluationConfig:
     temporal_ensemble: bool = False
     n_action_steps: Chunk | None = None
     strategy: str | None = None
-    inference_delay: Delay = 0
+    inference_delay: Delay | Literal["measured"] = 0
     num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
     workers: Processes = 2
     device: str = "auto"
@@ -225,7 +233,23 @@ class EvaluationPlan:
                 why = "the mouth is found in images"
             raise RequestError(f"{problem} ({why})")
         execution = choose_execution(checkpoint.execution, config)
-        return cls(config, checkpoint, env, xml_hash, execution, choose_device(config.device))
+        plan = cls(config, checkpoint, env, xml_hash, execution, choose_device(config.device))
+        return plan._measured() if config.inference_delay == MEASURED else plan
+
+    def _measured(self) -> EvaluationPlan:
+        """Return the plan with the delay of its results so far, or as a prediction takes.
+
+        The delay is the number of whole control steps in that time, as in real-time chunking
+        (arXiv 2506.07339, section 2).
+        """
+        if (there := recorded_settings(self.out)) is not None:
+            delay = ActionExecution.from_json(there.get("acting", {})).inference_delay
+        else:
+            with self._one_thread_if_small():
+                seconds = self.make_policy(1).prediction_time()
+            delay = int(seconds / CONTROL_PERIOD)
+            logger.info("a prediction takes %.1f ms: %d control steps", 1e3 * seconds, delay)
+        return replace(self, execution=replace(self.execution, inference_delay=delay))
 
     def __str__(self) -> str:
         execution, checkpoint, seeds = self.execution, self.checkpoint, self.config.seeds
@@ -337,7 +361,7 @@ class EvaluationPlan:
         """
         return load_model(self.checkpoint, self.device)
 
-    def make_policy(self, num_envs: int) -> ActingPolicy:
+    def make_policy(self, num_envs: int) -> PolicyRunner:
         """Make the network act in so many environments.
 
         Raises:
@@ -484,7 +508,9 @@ def choose_execution(trained: ActionExecution, config: EvaluationConfig) -> Acti
     Raises:
         RequestError: they do not go together.
     """
-    changes: dict[str, Any] = {"inference_delay": config.inference_delay}
+    changes: dict[str, Any] = {"inference_delay": 0}
+    if config.inference_delay != MEASURED:
+        changes = {"inference_delay": config.inference_delay}
     if config.n_action_steps is not None:
         changes |= {"temporal_ensemble": False, "n_action_steps": config.n_action_steps}
     if config.temporal_ensemble or config.strategy == "ensemble":

@@ -300,17 +300,28 @@ def open_results(
     write_text(path, "".join(f"{done[seed].to_line()}\n" for seed in sorted(done)))
 
 
-def _refuse_other_settings(folder: Path, settings: dict[str, Any]) -> None:
+def recorded_settings(folder: Path) -> dict[str, Any] | None:
+    """Return the settings of the results in a folder; None if there are none.
+
+    Raises:
+        RequestError: the folder is damaged.
+    """
     path = folder / MANIFEST
     if not path.exists():
         if (folder / RESULTS).exists():
             raise RequestError(f"'{folder}' holds {RESULTS} without {MANIFEST}; give another --out")
-        return
+        return None
     try:
         content = read_json(path, schema=SCHEMA)
-        there = convert(content.get("settings"), dict, f"'{path}': settings")
+        return convert(content.get("settings"), dict, f"'{path}': settings")
     except RequestError as error:
         raise RequestError(f"{error}; give another --out") from error
+
+
+def _refuse_other_settings(folder: Path, settings: dict[str, Any]) -> None:
+    there = recorded_settings(folder)
+    if there is None:
+        return
     wanted = as_json(settings)
     for name in sorted({*wanted, *there}):
         if there.get(name) != wanted.get(name):

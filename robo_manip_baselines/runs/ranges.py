@@ -40,7 +40,8 @@ _INTEGER = Interval(ge=-(1 << 63), lt=1 << 63)
 def require_ranges(config: Any, given: str = "{} {}") -> None:
     """Require every number of a dataclass, and of dataclasses in it, to be within its range.
 
-    Floats are finite, whatever their range; None is valid. Values of a ``Literal`` are one of it.
+    Floats are finite, whatever their range; None is valid. Values of a ``Literal`` are one of it,
+    or a number where the type has one beside it.
 
     Args:
         config: a dataclass.
@@ -53,9 +54,10 @@ def require_ranges(config: Any, given: str = "{} {}") -> None:
         value = getattr(config, name)
         for number in value if isinstance(value, (tuple, list)) else (value,):
             _require(given.format(option, shown(number)), number, interval)
-    for name, choices in _choices(type(config)):
-        if (value := getattr(config, name)) not in (*choices, None):
-            valid = ", ".join(map(str, choices))
+    for name, choices, numbers in _choices(type(config)):
+        value = getattr(config, name)
+        if value not in (*choices, None) and not isinstance(value, numbers):
+            valid = ", ".join([*map(str, choices), *["a number"] * bool(numbers)])
             raise RequestError(f"{given.format(name, shown(value))}: unknown; valid: {valid}")
     for item in dataclasses.fields(config):
         part = getattr(config, item.name)
@@ -130,15 +132,19 @@ def number_fields(kind: type) -> list[tuple[str, str, Interval | None]]:
 
 
 @cache
-def _choices(kind: type) -> list[tuple[str, tuple[Any, ...]]]:
-    """Return the fields of a dataclass whose type is a ``Literal``, and its values."""
+def _choices(kind: type) -> list[tuple[str, tuple[Any, ...], tuple[type, ...]]]:
+    """Return the fields of a dataclass whose type is a ``Literal``, or one of those and a number.
+
+    Each is (name, values of the ``Literal``, types of numbers).
+    """
     hints = typing.get_type_hints(kind, include_extras=True)
-    return [
-        (item.name, typing.get_args(part))
-        for item in dataclasses.fields(kind)
-        for part in _parts(hints[item.name])
-        if typing.get_origin(part) is Literal
-    ]
+    found = []
+    for item in dataclasses.fields(kind):
+        parts = list(_parts(hints[item.name]))
+        numbers = tuple(part for part in parts if part in (int, float))
+        literals = [part for part in parts if typing.get_origin(part) is Literal]
+        found += [(item.name, typing.get_args(part), numbers) for part in literals]
+    return found
 
 
 def _parts(hint: Any) -> Iterator[Any]:

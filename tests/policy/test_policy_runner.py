@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from robo_manip_baselines.data.normalization import Normalization
 from robo_manip_baselines.observation import ObservationSpec, ObservedNames
-from robo_manip_baselines.policy.execution import PolicyRunner
+from robo_manip_baselines.policy.execution import WARM_UP, PolicyRunner
 from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.runs.errors import RequestError
@@ -141,6 +141,25 @@ def test_only_environments_that_need_a_prediction_are_computed() -> None:
     assert fresh._model.rows == [1, 1]
     fresh.reset(one, [5])
     assert fresh.needs_images(np.array([0, 2])).tolist() == [True, True]
+
+
+@pytest.mark.parametrize("execution", [ENSEMBLE, FIRST])
+def test_the_time_of_a_prediction_is_measured_and_leaves_nothing(
+    execution: ActionExecution,
+) -> None:
+    own, other = policy(2, execution), policy(2, execution)
+    assert 0.0 < own.prediction_time(repeats=4) < 60.0
+    network = own._model
+    assert isinstance(network, Network)
+    assert len(network.rows) == WARM_UP + 4  # steps without a prediction do not count
+    both = np.arange(2)
+    for runner in (own, other):
+        runner.reset(both, [1, 2])
+    for seed in range(3):
+        vectors, images = observe(2, seed)
+        np.testing.assert_array_equal(
+            own.act(vectors, images, both), other.act(vectors, images, both)
+        )
 
 
 def test_rows_of_a_tile_that_are_not_used_do_not_matter() -> None:

@@ -29,6 +29,7 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.error_stats import DEFAULT_STATS, load_error_stats
 from robo_manip_baselines.policy.checkpoint import Checkpoint
+from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.policy.presets import ActionExecution
 from robo_manip_baselines.rollout.evaluation import (
     EvaluationConfig,
@@ -335,15 +336,39 @@ def test_the_execution_is_the_trained_one_unless_changed() -> None:
     assert chosen(strategy="ensemble") == ensemble
     late = chosen(strategy="naive", inference_delay=3)
     assert late == replace(trained, strategy="naive", inference_delay=3)
+    assert chosen(inference_delay="measured") == trained  # until it is
     assert (
         choose_execution(ensemble, EvaluationConfig(Path("run"), range(1), strategy="synchronous"))
         == trained
     )
 
 
+def test_a_measured_delay_is_that_of_the_clock_and_stays(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whole control steps of 0.02 s; results that are continued keep theirs."""
+    took = [0.019, 0.065, 0.5]
+    monkeypatch.setattr(PolicyRunner, "prediction_time", lambda _: took.pop(0))
+    asked = "--inference_delay measured --strategy synchronous --n_action_steps 2"
+    delays = [
+        EvaluationPlan.of(config(run_folder, asked, out=tmp_path / "new")).execution.inference_delay
+        for _ in range(2)
+    ]
+    assert delays == [0, 3]
+    took[:] = [0.041, 0.5]
+    for episodes in (1, 2):
+        given = f"{asked} --num_episodes {episodes}"
+        plan, summary, _ = evaluate(config(run_folder, given, out=tmp_path / "out"))
+        assert (plan.execution.inference_delay, summary.episodes) == (2, episodes)
+    assert took == [0.5]  # not measured again
+    with pytest.raises(RequestError, match="holds results with acting"):
+        evaluate(config(run_folder, asked.replace("measured", "1"), out=tmp_path / "out"))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"inference_delay": "soon"}, "inference_delay 'soon': unknown; valid: measured, a number"),
         ({"strategy": "fast"}, "unknown strategy 'fast'; valid: .*ensemble.*naive"),
         ({"strategy": "ensemble", "n_action_steps": 3}, "--strategy ensemble and --n_action_steps"),
         ({"strategy": "naive", "temporal_ensemble": True}, "and --strategy naive: give one"),
