@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import tyro
 from annotated_types import Interval
@@ -15,7 +15,7 @@ from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, require
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import Corruption, ObservationSpec
 from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
-from robo_manip_baselines.policy.presets import Chunk, Delay
+from robo_manip_baselines.policy.presets import Chunk, InferenceDelay
 from robo_manip_baselines.runs.command import last_value, parse
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import require_out_file
@@ -96,7 +96,7 @@ class PolicyOptions:
     temporal_ensemble: bool = False
     n_action_steps: Annotated[Chunk | None, tyro.conf.arg(aliases=["--execute"])] = None
     strategy: str | None = None
-    inference_delay: Delay | Literal["measured"] = 0
+    inference_delay: InferenceDelay = 0
     device: str = "auto"
     precision: str = "fp32"
     video: NonNegativeInt = 0

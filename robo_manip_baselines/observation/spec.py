@@ -62,7 +62,7 @@ MOUTH_SOURCES = ("truth", "camera", "depth_camera")
 face detector that looks at images of ``front_close``, without or with their depth."""
 
 MEASURED = "measured"
-"""Latency of the camera: as long as detector and predictor take."""
+"""Latency of the camera: as long as detector and predictor take; of a policy: as a prediction."""
 
 CameraLatency = Annotated[int, Interval(ge=0, le=MAX_DELAY)] | str
 """Frames of 1/30 s, or ``MEASURED``."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
@@ -37,8 +37,8 @@ MAX_CHUNK = 10_000
 
 Chunk = Annotated[int, Interval(ge=1, le=MAX_CHUNK)]
 Delay = Annotated[int, Interval(ge=0, le=MAX_CHUNK)]
-MEASURED = "measured"
-"""Delay of as many control steps as a prediction takes on this machine."""
+InferenceDelay = Delay | Literal["measured"]
+"""Control steps, or as many as a prediction takes on this machine."""
 Width = Annotated[int, Interval(ge=1, le=65536)]
 Layers = Annotated[int, Interval(ge=1, le=256)]
 

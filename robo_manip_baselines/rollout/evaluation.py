@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Interval
 
@@ -22,7 +22,7 @@ from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry, without_library_path
 from robo_manip_baselines.observation import Corruption, ObservationSpec
-from robo_manip_baselines.observation.spec import CameraLatency
+from robo_manip_baselines.observation.spec import MEASURED, CameraLatency
 from robo_manip_baselines.policy.checkpoint import (
     SHIPPED_PREFIX,
     Checkpoint,
@@ -31,11 +31,10 @@ from robo_manip_baselines.policy.checkpoint import (
     without_initial_weights,
 )
 from robo_manip_baselines.policy.presets import (
-    MEASURED,
     STRATEGIES,
     ActionExecution,
     Chunk,
-    Delay,
+    InferenceDelay,
 )
 from robo_manip_baselines.rollout.agreement import require_continuation
 from robo_manip_baselines.rollout.results import (
@@ -123,7 +122,7 @@ class EvaluationConfig:
     temporal_ensemble: bool = False
     n_action_steps: Chunk | None = None
     strategy: str | None = None
-    inference_delay: Delay | Literal["measured"] = 0
+    inference_delay: InferenceDelay = 0
     num_envs: Annotated[int, Interval(ge=1, le=4096)] = 8
     workers: Processes = 2
     device: str = "auto"
@@ -239,8 +238,8 @@ class EvaluationPlan:
     def _measured(self) -> EvaluationPlan:
         """Return the plan with the delay of its results so far, or as a prediction takes.
 
-        The delay is the number of whole control steps in that time, as in real-time chunking
-        (arXiv 2506.07339, section 2).
+        The delay is the number of whole control steps in that time: a prediction that takes less
+        than one is there before the next observation.
         """
         if (there := recorded_settings(self.out)) is not None:
             delay = ActionExecution.from_json(there.get("acting", {})).inference_delay
@@ -508,9 +507,8 @@ def choose_execution(trained: ActionExecution, config: EvaluationConfig) -> Acti
     Raises:
         RequestError: they do not go together.
     """
-    changes: dict[str, Any] = {"inference_delay": 0}
-    if config.inference_delay != MEASURED:
-        changes = {"inference_delay": config.inference_delay}
+    delay = 0 if config.inference_delay == MEASURED else config.inference_delay  # until it is
+    changes: dict[str, Any] = {"inference_delay": delay}
     if config.n_action_steps is not None:
         changes |= {"temporal_ensemble": False, "n_action_steps": config.n_action_steps}
     if config.temporal_ensemble or config.strategy == "ensemble":
