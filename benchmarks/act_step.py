@@ -7,7 +7,7 @@ Prints Markdown tables. Run: ``python benchmarks/act_step.py``.
 
 from __future__ import annotations
 
-import contextlib
+import copy
 import statistics
 import time
 from collections.abc import Callable
@@ -28,12 +28,23 @@ from robo_manip_baselines.policy.act.config import ActConfig  # noqa: E402
 from robo_manip_baselines.policy.act.model import ActModel  # noqa: E402
 from robo_manip_baselines.policy.cuda_graph import WARM_UP, Replay  # noqa: E402
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel  # noqa: E402
+from robo_manip_baselines.policy.presets import TrainSettings  # noqa: E402
 from robo_manip_baselines.runs.errors import RequestError, require_choice  # noqa: E402
-from robo_manip_baselines.training.device import choose_device, prepare_device  # noqa: E402
+from robo_manip_baselines.training.device import (  # noqa: E402
+    StepTimer,
+    choose_device,
+    prepare_device,
+)
+from robo_manip_baselines.training.state import TrainerState  # noqa: E402
+from robo_manip_baselines.training.step import LossModule, TrainingStep  # noqa: E402
 
 PHASES = ("transfer", "forward", "backward", "optimiser")
 LEARNING_RATE = 1e-5
-LONGEST_KERNELS = 15
+WEIGHT_DECAY = 1e-4
+LONGEST = 30
+"""Operators and kernels in a profile."""
+SHAPES = 70
+"""Characters of an operator's shapes."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +81,7 @@ class Options:
     public: bool = True
     """Time the public code's way, too."""
     profile: bool = False
-    """Say which kernels our steps spend the GPU's time in, and how long it waits; CUDA only."""
+    """Say in which operators and kernels our steps spend the GPU's time; CUDA only."""
 
     def __post_init__(self) -> None:
         require_choice("device", self.device, ("auto", "cpu", "cuda"))
@@ -136,64 +147,73 @@ def _wait(device: torch.device) -> None:
         torch.cuda.synchronize()
 
 
+class PublicStep:
+    """A step of training as public code does it: in fp32, with AdamW."""
+
+    def __init__(self, model: PolicyModel) -> None:
+        groups = cast("Any", model.parameter_groups(LEARNING_RATE))
+        self.model, self.optimizer = model, torch.optim.AdamW(groups, weight_decay=WEIGHT_DECAY)
+
+    def __call__(self, batch: Batch, mark: Callable[[str], None]) -> None:
+        """Change the weights."""
+        loss = self.model.loss(batch)["loss"]
+        mark("forward")
+        loss.backward()
+        mark("backward")
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+
+class OurStep:
+    """A step of training as the trainer does it."""
+
+    def __init__(self, model: PolicyModel, options: Options) -> None:
+        settings = TrainSettings(
+            learning_rate=LEARNING_RATE, weight_decay=WEIGHT_DECAY, epochs=1, compile=False
+        )
+        loss: Any = LossModule(model)
+        self.mark: Callable[[str], None] = lambda phase: None
+        self.step = TrainingStep(
+            torch.compile(loss) if options.compile else loss,
+            TrainerState(model, settings),
+            autocast=torch.bfloat16 if options.precision == "bf16" else None,
+            clip_norm=settings.clip_norm,
+            timer=cast("StepTimer", self),
+            is_recorded=options.cuda_graph,
+        )
+
+    def __call__(self, batch: Batch, mark: Callable[[str], None]) -> None:
+        """Change the weights; a recorded step is all in its forward phase."""
+        self.mark = mark
+        self.step(batch)
+
+
 class TimedNetwork:
     """Runs steps of one network and takes the time of each phase."""
 
     def __init__(self, model: PolicyModel, batch: Batch, options: Options, ours: bool) -> None:
-        self.device = options.where
-        self.clock = options.clock
-        self.model = model.to(self.device).train()
-        self.host_batch = batch
-        self.batch = _map(batch, lambda value: value.to(self.device))
-        self.bf16 = ours and options.precision == "bf16"
-        self.optimizer = torch.optim.AdamW(
-            cast("Any", model.parameter_groups(LEARNING_RATE)),
-            weight_decay=1e-4,
-            fused=True if ours else None,
-            capturable=ours and options.cuda_graph,
-        )
-        self.loss = torch.compile(model.loss) if ours and options.compile else model.loss
-        self.replay = Replay(self.compute, self.device) if ours and options.cuda_graph else None
+        self.device, self.clock, self.host_batch = options.where, options.clock, batch
+        model = model.to(self.device).train()
+        self.step: Callable[[Batch, Callable[[str], None]], None]
+        self.step = OurStep(model, options) if ours else PublicStep(model)
 
-    def autocast(self) -> contextlib.AbstractContextManager[Any]:
-        """The context of the forward pass."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
+    def load(self) -> Batch:
+        """Bring the batch from main memory."""
+        return _map(self.host_batch, lambda v: v.to(self.device, non_blocking=True))
 
-    def compute(self, mark: Callable[[], None] = lambda: None) -> None:
-        """One step on ``self.batch``."""
-        self.optimizer.zero_grad(set_to_none=True)
-        with self.autocast():
-            loss = self.loss(self.batch)["loss"]
-        mark()
-        loss.backward()
-        mark()
-        self.optimizer.step()
-        mark()
-
-    def load(self) -> None:
-        """Bring the batch from main memory; a recorded step reads it where it has always been."""
-        if self.replay is None:
-            self.batch = _map(self.host_batch, lambda v: v.to(self.device, non_blocking=True))
-        else:
-            _copy(self.host_batch, self.batch)
-
-    def step(self) -> list[float]:
-        """Seconds of each phase; a recorded step is all in its forward phase."""
+    def phases(self) -> list[float]:
+        """Seconds of each phase of a step."""
         marks: list[float] = []
 
-        def mark() -> None:
+        def mark(phase: str) -> None:
             _wait(self.device)
             marks.append(self.clock())
 
-        mark()
-        self.load()
-        mark()
-        if self.replay is None:
-            self.compute(mark)
-        else:
-            self.replay()
-            mark()
-            marks += [marks[-1]] * 2
+        mark("start")
+        batch = self.load()
+        mark("transfer")
+        self.step(batch, mark)
+        mark("optimiser")
         return [after - before for before, after in pairwise(marks)]
 
     def run(self, steps: int) -> float:
@@ -201,8 +221,7 @@ class TimedNetwork:
         _wait(self.device)
         start = self.clock()
         for _ in range(steps):
-            self.load()
-            self.compute() if self.replay is None else self.replay()
+            self.step(self.load(), lambda phase: None)
         _wait(self.device)
         return (self.clock() - start) / steps
 
@@ -282,7 +301,9 @@ def main() -> None:
         }
         print_steps(networks, options.steps)
         if options.profile:
-            print_kernels(networks["ours"], options.steps)
+            batch = make_batch(options, options.batch_size, as_float=False)
+            first = TimedNetwork(copy.deepcopy(models["ours"]), batch, options, ours=True)
+            print_kernels(networks["ours"], first, options.steps)
     if options.predictions:
         print("\n| one prediction | mean, ms | median, ms | 95 %, ms |\n|---|---|---|---|")
         for key, model in models.items():
@@ -296,11 +317,11 @@ def print_steps(networks: dict[str, TimedNetwork], steps: int) -> None:
     """Steps of each network in turn, so that whatever else the machine does is shared."""
     for network in networks.values():
         for _ in range(WARM_UP + 1):
-            network.step()
+            network.phases()
     phases: dict[str, list[list[float]]] = {key: [] for key in networks}
     for _ in range(steps):
         for key, network in networks.items():
-            phases[key].append(network.step())
+            phases[key].append(network.phases())
     print(f"\n| training step, ms | {' | '.join(PHASES)} | sum | without waiting |")
     print("|---|" + "---|" * (len(PHASES) + 2))
     sums: dict[str, float] = {}
@@ -313,20 +334,43 @@ def print_steps(networks: dict[str, TimedNetwork], steps: int) -> None:
         print(f"\nours is {sums['public way'] / sums['ours']:.1f} times as fast")
 
 
-def print_kernels(network: TimedNetwork, steps: int) -> None:
-    """Time of the GPU's kernels in a step, the longest first, and the time between kernels."""
+def print_kernels(network: TimedNetwork, first: TimedNetwork, steps: int) -> None:
+    """Where the GPU's time goes in a step: in which operators, of what shapes, and which kernels.
+
+    Operators are those of the second step of ``first``, whose kernels are launched one by one also
+    where later ones are replayed; kernels those of the steps as they are timed, the longest first.
+    """
     from torch.profiler import ProfilerActivity, profile
+
+    first.run(1)
+    activities = [ProfilerActivity.CPU, ProfilerActivity.CUDA]
+    with profile(activities=activities, record_shapes=True) as profiler:
+        first.run(1)
+    operators = [
+        event
+        for event in profiler.key_averages(group_by_input_shape=True)
+        if event.self_device_time_total > 0 and event.input_shapes
+    ]
+    operators.sort(key=lambda event: -event.self_device_time_total)
+    print("\n| operator | shapes | calls | ms |\n|---|---|---|---|")
+    for event in operators[:LONGEST]:
+        shapes = " ".join("x".join(map(str, shape)) for shape in event.input_shapes if shape)
+        cells = f"{event.count} | {event.self_device_time_total / 1e3:.3f}"
+        print(f"| {event.key} | {shapes[:SHAPES]} | {cells} |")
 
     with profile(activities=[ProfilerActivity.CUDA]) as profiler:
         seconds = network.run(steps)
     kernels = [e for e in profiler.key_averages() if e.self_device_time_total > 0]
     kernels.sort(key=lambda event: -event.self_device_time_total)
     busy = sum(event.self_device_time_total for event in kernels) / steps / 1e3
+    calls = sum(event.count for event in kernels) / steps
     print(f"\n| kernel, of {1e3 * seconds:.2f} ms a step | calls | ms |\n|---|---|---|")
-    for event in kernels[:LONGEST_KERNELS]:
+    for event in kernels[:LONGEST]:
         cells = f"{event.count / steps:.1f} | {event.self_device_time_total / steps / 1e3:.3f}"
         print(f"| {event.key[:70]} | {cells} |")
-    print(f"| all kernels and copies, some of them at once | | {busy:.2f} |", flush=True)
+    print(
+        f"| all kernels and copies, some of them at once | {calls:.0f} | {busy:.2f} |", flush=True
+    )
 
 
 if __name__ == "__main__":

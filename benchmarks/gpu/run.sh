@@ -7,7 +7,8 @@
 #
 # Environment variables (defaults):
 #   STEPS       which of "tests speed paper" to do, in this order (all)
-#   CONDITIONS  of the paper's study ("baseline current current_pred_h2")
+#   CONDITIONS  of the paper's study, the most important first; as many are trained as there is time
+#               for ("baseline current_pred_h2 current")
 #   WORK        folder of everything else (/tmp/paper)
 #   WHEELS      folder of wheels to install first; see wheels.sh (none)
 #   SIZE        "paper", or "tiny" for a try of a minute (paper)
@@ -15,7 +16,7 @@
 set -uo pipefail
 
 budget=${1:?"usage: benchmarks/gpu/run.sh BUDGET_S OUT"} out=${2:?"usage: benchmarks/gpu/run.sh BUDGET_S OUT"}
-steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-baseline current current_pred_h2}
+steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-baseline current_pred_h2 current}
 work=${WORK:-/tmp/paper} device=${DEVICE:-cuda} size=${SIZE:-paper}
 mkdir -p "$out" "$work"
 out=$(cd "$out" && pwd) work=$(cd "$work" && pwd)
@@ -33,7 +34,7 @@ do_step() {
     echo "$name: no time left" | tee -a "$out/times.txt"
     return 1
   fi
-  timeout --signal=TERM --kill-after=30 "$share" "$@" >>"$out/log.txt" 2>&1 || code=$?
+  timeout --signal=TERM --kill-after=10 "$share" "$@" >>"$out/log.txt" 2>&1 || code=$?
   echo "$name: $((SECONDS - start)) s, exit code $code" | tee -a "$out/times.txt"
   return "$code"
 }
@@ -61,26 +62,72 @@ mujoco.__version__, numpy.__version__, sep="\n")'
 } >"$out/versions.txt" 2>&1
 cat "$out/versions.txt"
 
+# Programs that share the GPU run at once, not in turns, while NVIDIA's MPS does. It changes no setting.
+mps() { [[ $device == cuda ]] && command -v nvidia-cuda-mps-control >/dev/null; }
+share_gpu() {
+  mps || return
+  export CUDA_MPS_PIPE_DIRECTORY=$work/mps CUDA_MPS_LOG_DIRECTORY=$work/mps
+  mkdir -p "$work/mps" && nvidia-cuda-mps-control -d
+}
+end_sharing() {
+  mps && [[ -n ${CUDA_MPS_PIPE_DIRECTORY:-} ]] && echo quit | nvidia-cuda-mps-control
+  unset CUDA_MPS_PIPE_DIRECTORY CUDA_MPS_LOG_DIRECTORY
+}
+
+timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --no_public)
+[[ $size == tiny ]] && timing+=(--image_size 48 64 --batch_size 1 --steps 1)
+[[ $device == cpu ]] && timing+=(--precision fp32)
+graph=() && [[ $device == cuda ]] && graph=(--cuda_graph)
+
+# time_together NAME COUNT: ms of a training step where so many are trained at once; nothing if it fails.
+time_together() {
+  local name=$1 count=$2 steps=150 number
+  [[ $size == tiny ]] && steps=1
+  for ((number = 1; number <= count; number++)); do
+    timeout --kill-after=1 45 "${timing[@]}" --steps "$steps" --predictions 0 "${graph[@]}" \
+      >"$work/$name-$number.txt" 2>&1 &
+  done
+  wait
+  cat "$work/$name"-*.txt >>"$out/log.txt"
+  awk -F '|' -v count="$count" '/^\| ours/ { sum += $(NF - 1); found++ }
+    END { if (found == count) printf "%.1f", sum / count }' "$work/$name"-*.txt
+}
+
 if [[ $steps == *tests* ]]; then
   do_step tests 90 python3 -m pytest -m cuda -n 4 --dist loadfile -p no:cacheprovider \
-    -W default tests/policy tests/training
+    -W default ${TESTS:-tests/policy tests/training}
+  code=$?
   grep -E "^(FAILED|ERROR|E  )|passed|failed|skipped" "$out/log.txt" | tail -20
+  ((code == 0)) || exit 1
 fi
 
 if [[ $steps == *speed* ]]; then
-  timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --steps 30 --predictions 50 --no_public)
-  [[ $size == tiny ]] && timing+=(--image_size 48 64 --batch_size 1 --steps 1 --predictions 1)
-  [[ $device == cpu ]] && timing+=(--precision fp32)
-  graph=() && [[ $device == cuda ]] && graph=(--cuda_graph)
-  do_step "bf16" 40 "${timing[@]}"
-  [[ $device == cuda ]] && do_step "bf16, CUDA graph" 40 "${timing[@]}" --cuda_graph --profile
-  [[ $size == tiny ]] || do_step "fp32, CUDA graph" 40 "${timing[@]}" --precision fp32 "${graph[@]}"
-  [[ $size == tiny ]] || do_step "bf16, compiled, CUDA graph" 100 "${timing[@]}" --compile "${graph[@]}"
+  do_step "bf16" 40 "${timing[@]}" --predictions 50
+  [[ $device == cuda ]] && do_step "bf16, CUDA graph" 60 "${timing[@]}" --cuda_graph --profile --predictions 50
+  [[ $size == tiny ]] || do_step "fp32, CUDA graph" 60 "${timing[@]}" --precision fp32 "${graph[@]}"
   sed -n '/, torch /,$p' "$out/log.txt"
 fi
 
+# Seconds for what is beside training: demonstrations, their images, the end; and for each evaluation.
+beside=105 evaluation=25
+
 if [[ $steps == *paper* ]]; then
-  command=(python3 bin/Benchmark.py feeding --preset paper --device "$device" --conditions $conditions
+  share_gpu
+  together=$(time_together three 3)
+  echo "three trainings at once: ${together:-failed} ms a step of each" | tee -a "$out/times.txt"
+  if [[ -z $together ]]; then
+    tail -n 3 "$work"/three-*.txt
+    end_sharing
+    together=$(time_together alone 3)
+    echo "without MPS: ${together:-failed} ms" | tee -a "$out/times.txt"
+  fi
+  [[ $size == tiny ]] && together=1
+  # So many conditions, one at least, as 12 500 steps of each leave time for.
+  number=$(awk -v ms="${together:-60}" -v left=$(($(left) - beside)) -v each=$evaluation 'BEGIN {
+    n = int(left / (12.5 * ms / 3 + each)); print n < 1 ? 1 : n }')
+  chosen=$(tr ' ' '\n' <<<"$conditions" | head -n "$number" | tr '\n' ' ')
+  echo "conditions: $chosen" | tee -a "$out/times.txt"
+  command=(python3 bin/Benchmark.py feeding --preset paper --device "$device" --conditions $chosen
     --num_workers "$(nproc)" --no_videos --out "$work/results/feeding_$size")
   if [[ $size == tiny ]]; then
     command+=(--demonstrations 3 --num_episodes 2
@@ -92,9 +139,10 @@ if [[ $steps == *paper* ]]; then
   monitor=$!
   (while sleep 45; do pack; done) &
   packer=$!
-  do_step paper "$(($(left) - 15))" "${command[@]}"
+  do_step paper "$(($(left) - 10))" "${command[@]}"
   kill $monitor $packer 2>/dev/null
   pack
+  end_sharing
   tail -25 "$out/log.txt"
 fi
 cat "$out/times.txt"

@@ -6,6 +6,7 @@ W image height and width, K actions of a chunk, A elements of an action, Z eleme
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -117,6 +118,10 @@ class PolicyModel(nn.Module):
     ) -> Tensor:
         """Return a chunk (B, K, A) that has the actions of weight 1, other than in `inpaint`."""
         raise NotImplementedError
+
+    def product_parameters(self) -> Iterator[str]:
+        """Yield the names of parameters that are read by products alone, which autocast casts."""
+        yield from ()
 
     def for_inference(self, dtype: torch.dtype) -> PolicyModel:
         """Return a network that only predicts; this one, unless a policy knows a faster form.

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.policy.checkpoint import Checkpoint, write_checkpoint
-from robo_manip_baselines.policy.interface import Batch, PolicyModel
+from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.runs.checkpoints import (
     BEST,
     prune_checkpoints,
@@ -49,7 +49,7 @@ from robo_manip_baselines.training.state import (
     learning_rate_factor,
     set_learning_rate,
 )
-from robo_manip_baselines.training.step import TrainingStep
+from robo_manip_baselines.training.step import LossModule, TrainingStep
 
 KEPT_CHECKPOINTS = 2
 
@@ -217,7 +217,7 @@ class Trainer:
         done = setup.total_steps, self._saved_step, seconds
         self._progress = StepProgress(*done, shown=processes.is_main)
         self._timer = StepTimer(device)
-        loss: nn.Module = _LossModule(model)
+        loss: nn.Module = LossModule(model)
         if processes.world_size > 1:
             loss = DistributedDataParallel(loss, gradient_as_bucket_view=True)
         self._step = TrainingStep(
@@ -380,18 +380,6 @@ class Trainer:
             f"{sum(p.numel() for p in parameters if p.requires_grad):,} trained",
         ):
             logger.info("%s", line)
-
-
-class _LossModule(nn.Module):
-    """A network whose call is its loss: the form that DDP and ``torch.compile`` take."""
-
-    def __init__(self, model: PolicyModel) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the loss and its parts."""
-        return self.model.loss(batch)
 
 
 class HeldOutLoss:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +22,7 @@ from robo_manip_baselines.policy.act.resnet import (
     ResNet18,
     feature_size,
     fold_for_inference,
+    for_products,
     load_backbone,
 )
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel, masked_mean
@@ -92,7 +95,31 @@ class Linear(nn.Linear):
         """Return (..., out_features)."""
         if self.weight.dtype != torch.float32:  # under autocast they are fp32: it does the casting
             input = input.to(self.weight.dtype)
+        if input.is_cuda and torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            return AffineProduct.apply(*map(for_products, (input, self.weight, self.bias)))
         return nn.functional.linear(input, self.weight, self.bias)
+
+
+class AffineProduct(torch.autograd.Function):
+    """Linear layer that sums the gradient of its bias over the tokens by a product with ones.
+
+    On a GPU PyTorch's sum over the first dimension takes longer than the gradient of the weights.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """Return (..., N) from (..., M), (N, M) and (N,), all of one type."""
+        ctx.save_for_backward(x, weight)
+        return nn.functional.linear(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        """Return the gradients of the three."""
+        x, weight = ctx.saved_tensors
+        gradient = gradients[0].flatten(0, -2)
+        of_x = (gradient @ weight).view(x.shape) if ctx.needs_input_grad[0] else None
+        ones = gradient.new_ones((1, len(gradient)))
+        return of_x, gradient.t() @ x.flatten(0, -2), (ones @ gradient).squeeze(0)
 
 
 class ExactLinear(nn.Linear):
@@ -129,7 +156,9 @@ class Attention(nn.Module):
             value_BMD: values: the same tokens without.
             keep_BM: bool, False for tokens to mask out; None for no mask.
         """
-        projected = self.query(query_BLD), self.key(key_BMD), self.value(value_BMD)
+        query = for_products(query_BLD)
+        key = query if key_BMD is query_BLD else key_BMD
+        projected = self.query(query), self.key(key), self.value(value_BMD)
         heads = [x_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for x_BLD in projected]
         heads[0] = heads[0].expand(len(key_BMD), -1, -1, -1)
         mask = None if keep_BM is None else keep_BM[:, None, None, :]
@@ -273,7 +302,8 @@ class Decoder(nn.Module):
         batch = 1 if self.training and self.dropout == 0.0 else len(memory_BMD)
         x_BLD = query_LD.new_zeros((batch, *query_LD.shape))
         # The positions of the memory are the same in every layer: added once.
-        memory_key_BMD = memory_BMD + position_MD
+        memory_key_BMD = for_products(memory_BMD + position_MD)
+        memory_BMD = for_products(memory_BMD)
         for layer in self.layers[: self.num_run]:
             x_BLD = layer(x_BLD, query_LD, memory_BMD, memory_key_BMD)
         return self.norm(x_BLD)
@@ -402,6 +432,12 @@ class ActModel(PolicyModel):
                 module.to(dtype)
         model.prediction = Prediction(model)
         return model.requires_grad_(False)
+
+    def product_parameters(self) -> Iterator[str]:
+        """Yield the names of parameters that are read by products alone, which autocast casts."""
+        for name, module in self.named_modules():
+            if isinstance(module, Linear):
+                yield from (f"{name}.{part}" for part, _ in module.named_parameters())
 
     def parameter_groups(self, learning_rate: float) -> list[dict[str, object]]:
         """Return two groups: everything else, and the backbone with its own learning rate."""

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
+from robo_manip_baselines.policy.act.pooling import max_pool_relu
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.tensors import read_tensors, require_finite
 
@@ -22,6 +23,12 @@ WIDTH = 64
 """Channels of the first of the four stages (He et al. 2016); each later one has twice as many."""
 
 STAGES = 4
+
+CELL = 2
+"""Pixels of a side of the cells that a GPU convolves in place of pixels: the first stride."""
+
+CELL_CHANNELS = 16
+"""Channels of a cell: 12 of four pixels, the others 0."""
 
 # Mean and standard deviation of ImageNet's colours from 0 to 1, with which torchvision's weights
 # were trained; public ACT uses them too.
@@ -55,12 +62,41 @@ class FrozenBatchNorm(nn.Module):
         return scale, self.bias - self.running_mean * scale
 
 
+def for_products(x: Tensor) -> Tensor:
+    """Return a tensor in the type of autocast's products, where there is autocast.
+
+    What several layers read is so cast once.
+    """
+    kind = x.device.type
+    if kind in ("cpu", "cuda") and torch.is_autocast_enabled(kind):
+        return x.to(torch.get_autocast_dtype(kind))
+    return x
+
+
 def convolve(x: Tensor, conv: nn.Conv2d, norm: nn.Module) -> Tensor:
     """Convolve and normalise in one pass over the image: the constants go into the kernel."""
+    kernel, shift = _folded(conv, norm)
+    return nn.functional.conv2d(x, kernel, shift, conv.stride, conv.padding)
+
+
+def convolve_relu(
+    x: Tensor, conv: nn.Conv2d, norm: nn.Module, shortcut: Tensor | None = None
+) -> Tensor:
+    """Convolve, normalise, add the shortcut and rectify; one kernel on a CUDA device."""
+    if torch.compiler.is_compiling():
+        y = convolve(x, conv, norm)
+        return nn.functional.relu(y if shortcut is None else y + shortcut)
+    kernel, shift = _folded(conv, norm)
+    return _ConvolveRelu.apply(x, kernel, shift, shortcut, conv.stride, conv.padding, True)
+
+
+def _folded(conv: nn.Conv2d, norm: nn.Module) -> tuple[Tensor, Tensor | None]:
+    """Kernel and bias that do the work of both, in the type in which autocast convolves."""
     if isinstance(norm, FrozenBatchNorm):
         kernel, shift = _fold(conv, norm)
-        return nn.functional.conv2d(x, kernel, shift, conv.stride, conv.padding)
-    return conv(x)
+    else:
+        kernel, shift = conv.weight, conv.bias
+    return for_products(kernel), None if shift is None else for_products(shift)
 
 
 def _fold(conv: nn.Conv2d, norm: FrozenBatchNorm) -> tuple[Tensor, Tensor]:
@@ -68,6 +104,55 @@ def _fold(conv: nn.Conv2d, norm: FrozenBatchNorm) -> tuple[Tensor, Tensor]:
     scale, shift = norm.scale_and_shift()
     kernel = conv.weight * scale[:, None, None, None]
     return kernel.contiguous(memory_format=torch.channels_last), shift
+
+
+class _ConvolveRelu(torch.autograd.Function):
+    """relu(conv2d(x, kernel) + shift + shortcut), of which only the result is kept.
+
+    Not differentiable in the shift, which is constant in training. ``is_rectified_back`` is False
+    where what follows passes no gradient on to elements that are 0.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        kernel: Tensor,
+        shift: Tensor | None,
+        shortcut: Tensor | None,
+        stride: tuple[int, int],
+        padding: tuple[int, int],
+        is_rectified_back: bool,
+    ) -> Tensor:
+        x = x.to(kernel.dtype)
+        shortcut = None if shortcut is None else shortcut.to(kernel.dtype)
+        if x.is_cuda:
+            others = shift, stride, padding, (1, 1), 1
+            if shortcut is None:
+                y = torch.cudnn_convolution_relu(x, kernel, *others)
+            else:
+                y = torch.cudnn_convolution_add_relu(x, kernel, shortcut, 1.0, *others)
+        else:
+            y = nn.functional.conv2d(x, kernel, shift, stride, padding)
+            if shortcut is not None:
+                y.add_(shortcut)
+            nn.functional.relu(y, inplace=True)
+        ctx.save_for_backward(x, kernel, y)
+        ctx.settings = stride, padding, is_rectified_back
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        x, kernel, y = ctx.saved_tensors
+        stride, padding, is_rectified_back = ctx.settings
+        gradient = gradients[0]
+        if is_rectified_back:
+            gradient = torch.ops.aten.threshold_backward(gradient, y, 0)
+        wanted = [*ctx.needs_input_grad[:2], False]
+        others = stride, padding, (1, 1), False, (0, 0), 1, wanted
+        of_x, of_kernel, _ = torch.ops.aten.convolution_backward(gradient, x, kernel, None, *others)
+        beside = gradient if ctx.needs_input_grad[3] else None
+        return of_x, of_kernel, None, beside, None, None, None
 
 
 class BasicBlock(nn.Module):
@@ -88,12 +173,11 @@ class BasicBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the feature map of the next block."""
-        change = nn.functional.relu(convolve(x, self.conv1, self.bn1), inplace=True)
-        change = convolve(change, self.conv2, self.bn2)
+        inner = convolve_relu(x, self.conv1, self.bn1)
         if self.downsample is not None:
             conv, norm = self.downsample
             x = convolve(x, cast("nn.Conv2d", conv), norm)
-        return nn.functional.relu(change.add_(x), inplace=True)
+        return convolve_relu(inner, self.conv2, self.bn2, shortcut=x)
 
 
 class ResNet18(nn.Module):
@@ -134,14 +218,48 @@ class ResNet18(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (I, F, h, w) for (I, H, W, 3) uint8 images."""
-        # (H, W, 3) images seen as (3, H, W) are in the channels-last order already.
-        x = (images.permute(0, 3, 1, 2) - self.mean) * self.scale
-        x = convolve(x.to(self.conv1.weight.dtype), self.conv1, self.bn1)
+        in_cells = (
+            images.is_cuda
+            and not torch.compiler.is_compiling()
+            and images.shape[1] % CELL == images.shape[2] % CELL == 0
+        )
+        x = self._stem_of_cells(images) if in_cells else self._stem(images)
         # Rectifying after the maximum gives the same numbers and has a quarter of them to do.
-        x = nn.functional.relu(nn.functional.max_pool2d(x, 3, 2, 1), inplace=True)
+        x = max_pool_relu(x)
         for stage in range(1, STAGES + 1):
             x = self.get_submodule(f"layer{stage}")(x)
         return x
+
+    def _stem(self, images: Tensor) -> Tensor:
+        """Return (I, F / 8, H / 2, W / 2) of the first convolution."""
+        # (H, W, 3) images seen as (3, H, W) are in the channels-last order already.
+        x = (images.permute(0, 3, 1, 2) - self.mean) * self.scale
+        return convolve(x.to(self.conv1.weight.dtype), self.conv1, self.bn1)
+
+    def _stem_of_cells(self, images: Tensor) -> Tensor:
+        """Return the same, rectified, from cells of 2x2 pixels; H and W are even.
+
+        A kernel of 7x7 pixels that moves by 2 is one of 4x4 cells that moves by 1. A GPU multiplies
+        8 channels at a time: of a pixel there are 3, of a cell 12.
+        """
+        count, height, width, _ = images.shape
+        rows, columns = height // CELL, width // CELL
+        cells = images.view(count, rows, CELL, columns, CELL, 3).transpose(2, 3)
+        pixels = cells.reshape(count, rows, columns, CELL**2, 3)
+        pixels = (pixels - self.mean.view(3)) * self.scale.view(3)
+        kernel, shift = _folded(self.conv1, self.bn1)
+        # Three pixels of zeros before and after are two cells before, with one pixel that a row and
+        # a column of zeros in the kernel leave out, and one after.
+        shape = count, rows + 3, columns + 3, CELL_CHANNELS
+        x = torch.zeros(shape, dtype=kernel.dtype, device=images.device)
+        x[:, 2:-1, 2:-1, : 3 * CELL**2] = pixels.flatten(3)
+        kernel = nn.functional.pad(kernel, (1, 0, 1, 0))
+        kernel = kernel.unflatten(3, (-1, CELL)).unflatten(2, (-1, CELL))
+        kernel = kernel.permute(0, 3, 5, 1, 2, 4).flatten(1, 3)
+        kernel = nn.functional.pad(kernel, (0, 0, 0, 0, 0, CELL_CHANNELS - kernel.shape[1]))
+        kernel = kernel.contiguous(memory_format=torch.channels_last)
+        x = x.permute(0, 3, 1, 2)
+        return _ConvolveRelu.apply(x, kernel, shift, None, (1, 1), (0, 0), False)
 
 
 def fold_for_inference(backbone: ResNet18) -> None:
