@@ -7,8 +7,8 @@
 #
 # Environment variables (defaults):
 #   STEPS       which of "tests speed paper" to do, in this order (all)
-#   CONDITIONS  of the paper's study, the most important first; as many are trained as there is time
-#               for ("baseline current_pred_h2 current")
+#   CONDITIONS  of the paper's study (as many of "baseline current_pred_h2 current" as there is time
+#               for, by the time of a step that is measured first)
 #   WORK        folder of everything else (/tmp/paper)
 #   WHEELS      folder of wheels to install first; see wheels.sh (none)
 #   SIZE        "paper", or "tiny" for a try of a minute (paper)
@@ -16,7 +16,7 @@
 set -uo pipefail
 
 budget=${1:?"usage: benchmarks/gpu/run.sh BUDGET_S OUT"} out=${2:?"usage: benchmarks/gpu/run.sh BUDGET_S OUT"}
-steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-baseline current_pred_h2 current}
+steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-}
 work=${WORK:-/tmp/paper} device=${DEVICE:-cuda} size=${SIZE:-paper}
 mkdir -p "$out" "$work"
 out=$(cd "$out" && pwd) work=$(cd "$work" && pwd)
@@ -67,7 +67,11 @@ mps() { [[ $device == cuda ]] && command -v nvidia-cuda-mps-control >/dev/null; 
 share_gpu() {
   mps || return
   export CUDA_MPS_PIPE_DIRECTORY=$work/mps CUDA_MPS_LOG_DIRECTORY=$work/mps
-  mkdir -p "$work/mps" && nvidia-cuda-mps-control -d
+  mkdir -p "$work/mps"
+  nvidia-cuda-mps-control -d
+  timeout --kill-after=1 30 python3 -c 'import torch; torch.ones(1, device="cuda").item()' && return
+  echo "MPS does not work here: programs share the GPU in turns" | tee -a "$out/times.txt"
+  end_sharing
 }
 end_sharing() {
   mps && [[ -n ${CUDA_MPS_PIPE_DIRECTORY:-} ]] && echo quit | nvidia-cuda-mps-control
@@ -79,22 +83,22 @@ timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --no_publi
 [[ $device == cpu ]] && timing+=(--precision fp32)
 graph=() && [[ $device == cuda ]] && graph=(--cuda_graph)
 
-# time_together NAME COUNT: ms of a training step where so many are trained at once; nothing if it fails.
+# ms of a training step of each where three are trained at once; nothing if that fails.
 time_together() {
-  local name=$1 count=$2 steps=150 number
+  local steps=150 number
   [[ $size == tiny ]] && steps=1
-  for ((number = 1; number <= count; number++)); do
-    timeout --kill-after=1 45 "${timing[@]}" --steps "$steps" --predictions 0 "${graph[@]}" \
-      >"$work/$name-$number.txt" 2>&1 &
+  for number in 1 2 3; do
+    timeout --kill-after=1 60 "${timing[@]}" --steps "$steps" --predictions 0 "${graph[@]}" \
+      >"$work/together-$number.txt" 2>&1 &
   done
   wait
-  cat "$work/$name"-*.txt >>"$out/log.txt"
-  awk -F '|' -v count="$count" '/^\| ours/ { sum += $(NF - 1); found++ }
-    END { if (found == count) printf "%.1f", sum / count }' "$work/$name"-*.txt
+  cat "$work"/together-*.txt >>"$out/log.txt"
+  awk -F '|' '/^\| ours/ { sum += $(NF - 1); found++ } END { if (found == 3) printf "%.1f", sum / 3 }' \
+    "$work"/together-*.txt
 }
 
 if [[ $steps == *tests* ]]; then
-  do_step tests 90 python3 -m pytest -m cuda -n 4 --dist loadfile -p no:cacheprovider \
+  do_step tests 90 python3 -m pytest -m cuda -p no:cacheprovider \
     -W default ${TESTS:-tests/policy tests/training}
   code=$?
   grep -E "^(FAILED|ERROR|E  )|passed|failed|skipped" "$out/log.txt" | tail -20
@@ -113,21 +117,16 @@ beside=105 evaluation=25
 
 if [[ $steps == *paper* ]]; then
   share_gpu
-  together=$(time_together three 3)
-  echo "three trainings at once: ${together:-failed} ms a step of each" | tee -a "$out/times.txt"
-  if [[ -z $together ]]; then
-    tail -n 3 "$work"/three-*.txt
-    end_sharing
-    together=$(time_together alone 3)
-    echo "without MPS: ${together:-failed} ms" | tee -a "$out/times.txt"
+  if [[ -z $conditions ]]; then
+    together=$(time_together)
+    echo "three trainings at once: ${together:-failed} ms a step of each" | tee -a "$out/times.txt"
+    # So many, one at least, as 12 500 steps of each leave time for.
+    number=$(awk -v ms="${together:-60}" -v left=$(($(left) - beside)) -v each=$evaluation 'BEGIN {
+      n = int(left / (12.5 * ms / 3 + each)); print n < 1 ? 1 : n }')
+    conditions=$(printf '%s\n' baseline current_pred_h2 current | head -n "$number" | tr '\n' ' ')
   fi
-  [[ $size == tiny ]] && together=1
-  # So many conditions, one at least, as 12 500 steps of each leave time for.
-  number=$(awk -v ms="${together:-60}" -v left=$(($(left) - beside)) -v each=$evaluation 'BEGIN {
-    n = int(left / (12.5 * ms / 3 + each)); print n < 1 ? 1 : n }')
-  chosen=$(tr ' ' '\n' <<<"$conditions" | head -n "$number" | tr '\n' ' ')
-  echo "conditions: $chosen" | tee -a "$out/times.txt"
-  command=(python3 bin/Benchmark.py feeding --preset paper --device "$device" --conditions $chosen
+  echo "conditions: $conditions" | tee -a "$out/times.txt"
+  command=(python3 bin/Benchmark.py feeding --preset paper --device "$device" --conditions $conditions
     --num_workers "$(nproc)" --no_videos --out "$work/results/feeding_$size")
   if [[ $size == tiny ]]; then
     command+=(--demonstrations 3 --num_episodes 2

@@ -469,7 +469,10 @@ class BatchLoader:
         images = torch.empty(shape, dtype=torch.uint8, device=self._device)
         for first in range(0, len(self._rows), UPLOAD):
             part = self._rows[first : first + UPLOAD]
-            images[first : first + len(part)] = torch.from_numpy(self._images.images(part))
+            source = self._images.held[part[0] : part[-1] + 1]  # rows in their order: no copy
+            if not np.array_equal(part, np.arange(part[0], part[-1] + 1)):
+                source = self._images.images(part)
+            images[first : first + len(part)] = torch.from_numpy(source)
         return images
 
 

@@ -96,7 +96,11 @@ class Linear(nn.Linear):
         if self.weight.dtype != torch.float32:  # under autocast they are fp32: it does the casting
             input = input.to(self.weight.dtype)
         if input.is_cuda and torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            return AffineProduct.apply(*map(for_products, (input, self.weight, self.bias)))
+            tokens, weight, bias = map(for_products, (input, self.weight, self.bias))
+            # What a function returns must be no view if others are to change it in place.
+            return AffineProduct.apply(tokens.flatten(0, -2), weight, bias).view(
+                *input.shape[:-1], -1
+            )
         return nn.functional.linear(input, self.weight, self.bias)
 
 
@@ -108,7 +112,7 @@ class AffineProduct(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Return (..., N) from (..., M), (N, M) and (N,), all of one type."""
+        """Return (L, N) from (L, M), (N, M) and (N,), all of one type."""
         ctx.save_for_backward(x, weight)
         return nn.functional.linear(x, weight, bias)
 
@@ -116,10 +120,10 @@ class AffineProduct(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
         """Return the gradients of the three."""
         x, weight = ctx.saved_tensors
-        gradient = gradients[0].flatten(0, -2)
-        of_x = (gradient @ weight).view(x.shape) if ctx.needs_input_grad[0] else None
+        gradient = gradients[0]
+        of_x = gradient @ weight if ctx.needs_input_grad[0] else None
         ones = gradient.new_ones((1, len(gradient)))
-        return of_x, gradient.t() @ x.flatten(0, -2), (ones @ gradient).squeeze(0)
+        return of_x, gradient.t() @ x, (ones @ gradient).squeeze(0)
 
 
 class ExactLinear(nn.Linear):
