@@ -118,10 +118,10 @@ PRESETS: dict[str, BenchmarkPreset] = {
         demonstrations=50,
         demonstration_block=4,
         num_episodes=50,
-        episode_block=10,
+        episode_block=4,
         # A checkpoint, with the optimiser a gigabyte, takes as long as a hundred steps.
         train_settings={"checkpoint_every": 4000},
-        num_envs=10,
+        num_envs=4,
         device="cuda",
         precision="bf16",
         gpu_share=0.125,
