@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -77,7 +77,8 @@ class Options:
         approaches: Approaches; cross_attention_residual has a connection around its attention.
         splits: sequence, the paper's; person.
         seeds: Seeds of the trainings, each also the part or fold that it leaves for the report.
-        size: Side of the images.
+        preset: Sizes of the networks: cpu, at --size; or paper, 256 pixels, for a GPU.
+        size: Side of the images in the preset cpu.
         settings: Settings of all networks, as NAME=VALUE: landmark_weight=468 is equation 4 to the
             letter (not of image_only). Give such trainings another --out.
         steps: Optimiser steps of each training; a larger number extends trainings.
@@ -91,6 +92,7 @@ class Options:
         kinds: Kinds of footage in the tables.
         detector_model: MediaPipe's face_landmarker.task, for image_only.
         resamples: Resamples of the intervals of each evaluation.
+        memory_gb: Memory for decoded images of a training in GB.
         only_times: Only measure processor times, on images at random: seconds.
         out: Folder of runs, evaluations and tables.
     """
@@ -99,6 +101,7 @@ class Options:
     approaches: tuple[str, ...] = tuple(APPROACHES)
     splits: tuple[str, ...] = SPLITS
     seeds: tuple[Seed, ...] = (0, 1, 2)
+    preset: Literal["cpu", "paper"] = "cpu"
     size: Count = 32
     settings: tuple[str, ...] = ()
     steps: Count = 8000
@@ -111,6 +114,7 @@ class Options:
     kinds: tuple[str, ...] = ("natural", "head_motion")
     detector_model: Path | None = None
     resamples: Count = 2000
+    memory_gb: Amount = 2.0
     only_times: bool = False
     out: Path = Path("results/approaches")
 
@@ -165,7 +169,7 @@ def train(options: Options, training: Training) -> Path:
     done = folder / "config.json"
     if done.is_file() and read_json(done)["training"]["steps"] >= options.steps:
         return folder
-    channels = f"channels={list(CHANNELS[options.size])}"
+    sizes = (f"size={options.size}", f"channels={list(CHANNELS[options.size])}")
     given = FaceTrainOptions(
         model=network,  # type: ignore[arg-type]
         dataset=options.dataset,
@@ -173,7 +177,8 @@ def train(options: Options, training: Training) -> Path:
         split=training.split,
         out=folder,
         seed=training.seed,
-        settings=(f"size={options.size}", channels, *settings, *options.settings),
+        preset=options.preset,
+        settings=(*(sizes if options.preset == "cpu" else ()), *settings, *options.settings),
         steps=options.steps,
         batch_size=options.batch_size,
         learning_rate=training.learning_rate,
@@ -184,7 +189,7 @@ def train(options: Options, training: Training) -> Path:
         validate_every=options.validate_every,
         validation_sequences=48,
         log_every=50,
-        memory_gb=2.0,
+        memory_gb=options.memory_gb,
     )
     if run_train(given):
         raise RequestError(f"{training.name}: interrupted; the same command carries on")

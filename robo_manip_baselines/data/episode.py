@@ -6,7 +6,8 @@ Images are RGB, (H, W, 3) uint8, and stored as JPEG, PNG or raw.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -170,11 +171,38 @@ class EpisodeReader:
         require_choice("camera", camera, self.cameras)
         if not 0 <= step < len(self):
             raise RequestError(f"'{self.path}' has steps 0…{len(self) - 1}, not {step}")
+        with self._reading(camera, step):
+            return self._sized(self._frame_store(camera).encoded(step))
+
+    def encoded_frames(self, camera: str) -> Iterator[np.ndarray]:
+        """The bytes of every image of a camera, in order, as `encoded_frame` returns them.
+
+        They are read together, in less than half the time of one after another.
+
+        Raises:
+            RequestError: for a camera that the episode does not have.
+            EpisodeFileError: if the bytes are damaged.
+        """
+        require_choice("camera", camera, self.cameras)
+        with self._reading(camera, 0):
+            store = self._frame_store(camera)
+        frames = store.all_encoded()
+        for step in range(len(self)):
+            with self._reading(camera, step):
+                data = self._sized(next(frames))
+            yield data
+
+    def _sized(self, data: np.ndarray) -> np.ndarray:
+        """Return the bytes of an image; raise ValueError if they declare another size."""
+        if list(size := encoded_size(data)) != self.attributes["image_size"]:
+            raise ValueError(f"it is {size}, not {self.attributes['image_size']}")
+        return data
+
+    @contextmanager
+    def _reading(self, camera: str, step: int) -> Iterator[None]:
+        """Say of which image an error is."""
         try:
-            data = self._frame_store(camera).encoded(step)
-            if list(size := encoded_size(data)) != self.attributes["image_size"]:
-                raise ValueError(f"it is {size}, not {self.attributes['image_size']}")
-            return data
+            yield
         except READ_ERRORS as error:
             raise EpisodeFileError(
                 f"'{self.path}': frame {step} of '{camera}' cannot be read: {one_line(error)}"
@@ -238,7 +266,21 @@ class FrameStore:
         """One image as it was given to the writer; raises if it is not that any more."""
         place = self._offset
         rows = step if place is None else slice(int(place[step]), int(place[step + 1]))
-        data = np.asarray(self._data[rows])
+        return self._checked(np.asarray(self._data[rows]), step)
+
+    def all_encoded(self) -> Iterator[np.ndarray]:
+        """Every image in order, as `encoded` returns it; those of a few kB are read together."""
+        place, data = self._offset, None
+        if place is not None:
+            with suppress(*READ_ERRORS):  # of one of them, which is found below
+                data = np.asarray(self._data[...])
+        for step in range(len(self.checksum)):
+            if data is None or place is None:
+                yield self.encoded(step)
+            else:
+                yield self._checked(data[place[step] : place[step + 1]], step)
+
+    def _checked(self, data: np.ndarray, step: int) -> np.ndarray:
         if image_checksum(data) != int(self.checksum[step]):
             raise ValueError("its checksum is wrong")
         return data

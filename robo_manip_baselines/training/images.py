@@ -147,10 +147,9 @@ class ImageStore(AbstractContextManager["ImageStore"]):
 
         def decode_episode(index: int) -> None:
             with EpisodeReader(self._paths[index]) as episode:
-                for step in range(len(episode)):
-                    images = held[self._offsets[index] + step]
-                    for camera, image in zip(self._cameras, images, strict=True):
-                        data = episode.encoded_frame(camera, step)
+                for number, camera in enumerate(self._cameras):
+                    for step, data in enumerate(episode.encoded_frames(camera)):
+                        image = held[self._offsets[index] + step, number]
                         _decode(data, image, episode.path, camera, step)
 
         numbers = range(len(self._paths))
