@@ -129,7 +129,7 @@ class CastParameters:
     def __init__(self, module: nn.Module, names: Sequence[str], dtype: torch.dtype) -> None:
         self._module = module
         parameters = dict(module.named_parameters())
-        self._parameters = [parameters[name] for name in names]
+        self._parameters: list[Tensor] = [parameters[name] for name in names]
         self._gradients = [torch.zeros_like(p) for p in self._parameters]
         copies = [p.detach().to(dtype).requires_grad_(p.requires_grad) for p in self._parameters]
         self._copies = dict(zip(names, copies, strict=True))
@@ -153,7 +153,7 @@ class CastParameters:
             copy.grad = None
 
 
-def _foreach_copy(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
+def _foreach_copy(targets: list[Tensor], sources: list[Tensor]) -> None:
     torch._foreach_copy_(targets, sources)  # pyright: ignore[reportPrivateImportUsage]
 
 

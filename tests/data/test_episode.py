@@ -246,3 +246,17 @@ def test_damaged_frame_is_an_error_when_it_is_read(tmp_path: Path) -> None:
         episode.frame("front_close", 5)
         with pytest.raises(EpisodeFileError, match=r"frame 5 of 'top' .*: its checksum is wrong"):
             episode.frame("top", 5)
+        # One checksum is of several small images together: the first of them is named.
+        with pytest.raises(EpisodeFileError, match=r"frame 0 of 'top' .*: its checksum is wrong"):
+            list(episode.encoded_frames("top"))
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "png", "raw"])
+def test_all_images_of_a_camera_are_those_read_one_by_one(tmp_path: Path, codec: str) -> None:
+    images = make_images(codec=codec)
+    path = write_episode(tmp_path / "a.hdf5", make_arrays(), images, make_attributes(codec=codec))
+    with EpisodeReader(path) as episode:
+        for camera in episode.cameras:
+            frames = list(episode.encoded_frames(camera))
+            assert len(frames) == len(episode)
+            assert all(np.array_equal(x, y) for x, y in zip(frames, images[camera], strict=True))

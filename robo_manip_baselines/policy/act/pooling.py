@@ -68,7 +68,7 @@ class MaxPoolRelu(torch.autograd.Function):
         place = torch.empty_like(y, dtype=torch.uint8)
         pixels = count * rows * columns
         sizes = height, width, rows, columns, pixels, channels, PIXELS
-        _forward[(triton.cdiv(pixels, PIXELS),)](x, y, place, *sizes)
+        _forward_kernel[(triton.cdiv(pixels, PIXELS),)](x, y, place, *sizes)
         ctx.save_for_backward(place)
         ctx.size = height, width
         return y
@@ -87,7 +87,7 @@ class MaxPoolRelu(torch.autograd.Function):
         )
         pixels = count * height * width
         sizes = height, width, rows, columns, pixels, channels, PIXELS
-        _backward[(triton.cdiv(pixels, PIXELS),)](gradient, place, found, *sizes)
+        _backward_kernel[(triton.cdiv(pixels, PIXELS),)](gradient, place, found, *sizes)
         return found
 
 
@@ -100,8 +100,8 @@ def _forward(
     rows,
     columns,
     pixels,
-    channels: tl.constexpr,
-    block: tl.constexpr,
+    channels: tl.constexpr,  # pyright: ignore[reportInvalidTypeForm]
+    block: tl.constexpr,  # pyright: ignore[reportInvalidTypeForm]
 ):
     """Largest of the nine pixels, or 0, and which of them it is."""
     pixel = tl.program_id(0) * block + tl.arange(0, block)
@@ -135,8 +135,8 @@ def _backward(
     rows,
     columns,
     pixels,
-    channels: tl.constexpr,
-    block: tl.constexpr,
+    channels: tl.constexpr,  # pyright: ignore[reportInvalidTypeForm]
+    block: tl.constexpr,  # pyright: ignore[reportInvalidTypeForm]
 ):
     """Sum of the gradients of the one, two or four results in which a pixel may be the largest."""
     pixel = tl.program_id(0) * block + tl.arange(0, block)
@@ -161,5 +161,5 @@ def _backward(
     tl.store(found_ptr + target, total.to(found_ptr.dtype.element_ty), mask=kept)
 
 
-if triton is not None:
-    _forward, _backward = triton.jit(_forward), triton.jit(_backward)
+_forward_kernel: Any = triton and triton.jit(_forward)
+_backward_kernel: Any = triton and triton.jit(_backward)
