@@ -192,3 +192,13 @@ def test_the_gradient_of_the_loss_on_a_gpu(make_model, make_batch):
             assert parameter.grad is not None
             pair = parameter.grad.cpu().flatten(), expected[name].flatten()
             assert nn.functional.cosine_similarity(*pair, dim=0) > 0.95, name
+
+
+@pytest.mark.cuda
+def test_predictions_on_a_gpu(make_model, make_batch):
+    model, batch = make_model(backbone_width=64).eval(), make_batch()
+    expected = model.predict(batch.state, batch.images, None)
+    copied = model.for_inference(torch.bfloat16).cuda()
+    with torch.inference_mode():
+        found = copied.predict(batch.state.cuda(), batch.images.cuda(), None)
+    assert_near(found.cpu(), expected, 0.05)
