@@ -34,7 +34,7 @@ demo: setup opengl ## five scripted episodes, a preview video, three trained pol
 smoke: setup opengl ## a benchmark in miniature, trainings included (3 minutes); part of what CI runs
 	$(BIN)/python bin/Benchmark.py feeding --preset smoke --out $(SMOKE_RESULTS)
 
-test: setup opengl ## every test but the slow ones (15 to 20 minutes on two cores)
+test: setup opengl ## every test but the slow ones (10 minutes on two cores)
 	$(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)
 
 test-fast: export MUJOCO_GL := disabled # so that a test that draws after all is found out

@@ -13,7 +13,7 @@
 #   WHEELS      folder of wheels to install first; see wheels.sh (none)
 #   SIZE        "paper", or "tiny" for a try of some minutes (paper)
 #   DEVICE      cuda or cpu (cuda)
-source "$(dirname "$0")/common.sh"
+source "$(dirname "$0")/machine.sh"
 read -ra approaches <<<"${APPROACHES:-image_only simple_fusion cross_attention residual}"
 
 # Steps by which a step is timed, and seconds for the evaluations and for starting again.

@@ -13,7 +13,7 @@
 #   WHEELS      folder of wheels to install first; see wheels.sh (none)
 #   SIZE        "paper", or "tiny" for a try of a minute (paper)
 #   DEVICE      cuda or cpu (cuda)
-source "$(dirname "$0")/common.sh"
+source "$(dirname "$0")/machine.sh"
 steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-}
 
 timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --no_public)

@@ -1,5 +1,5 @@
-# What the scripts of this folder share; sourced with BUDGET_S and OUT. Afterwards the working directory is
-# the repository, `out` and `work` are absolute, and packages of WHEELS are installed in `work`.
+# A GPU machine for so many seconds: its packages, its clock and its sharing; sourced with BUDGET_S and OUT. Afterwards
+# the working directory is the repository, `out` and `work` are absolute, and packages of WHEELS are installed.
 set -uo pipefail
 
 usage="usage: ${BASH_SOURCE[1]} BUDGET_S OUT"
