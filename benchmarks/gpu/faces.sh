@@ -27,7 +27,7 @@ command=(python3 benchmarks/approaches.py --dataset "${DATASET:-face_dataset}" -
 train() {
   local split
   for split in sequence person; do
-    do_step "$split, $1 steps" "$(($(left) - 10))" "${command[@]}" --splits "$split" --steps "$1" &
+    do_step "$split, $1 steps" "$(($(left) - SAVING - 5))" "${command[@]}" --splits "$split" --steps "$1" &
   done
   wait $(jobs -p)
 }

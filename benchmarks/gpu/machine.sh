@@ -12,6 +12,9 @@ export MUJOCO_GL=${MUJOCO_GL:-egl} PYTHONUNBUFFERED=1 PYTHONPATH="$work/site:$PW
 
 left() { echo $((budget - SECONDS)); }
 
+# Seconds that a training has to save its state when its time is over, so that the next call goes on there.
+SAVING=40
+
 # do_step NAME SHARE_S COMMAND...: run it, for its share of the time at most, and note how it ended.
 do_step() {
   local name=$1 share=$2 start=$SECONDS code=0
@@ -21,7 +24,7 @@ do_step() {
     echo "$name: no time left" | tee -a "$out/times.txt"
     return 1
   fi
-  timeout --signal=TERM --kill-after=10 "$share" "$@" >>"$out/log.txt" 2>&1 || code=$?
+  timeout --signal=TERM --kill-after="$SAVING" "$share" "$@" >>"$out/log.txt" 2>&1 || code=$?
   echo "$name: $((SECONDS - start)) s, exit code $code" | tee -a "$out/times.txt"
   return "$code"
 }

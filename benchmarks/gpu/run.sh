@@ -7,37 +7,23 @@
 #
 # Environment variables (defaults):
 #   STEPS       which of "tests speed paper" to do, in this order (all)
-#   CONDITIONS  of the paper's study (as many of "baseline current_pred_h2 current" as there is time
-#               for, by the time of a step that is measured first)
+#   CONDITIONS  of the paper's study ("baseline current current_pred_h2")
 #   WORK        folder of everything else (/tmp/paper)
 #   WHEELS      folder of wheels to install first; see wheels.sh (none)
 #   SIZE        "paper", or "tiny" for a try of a minute (paper)
 #   DEVICE      cuda or cpu (cuda)
 source "$(dirname "$0")/machine.sh"
-steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-}
+steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-baseline current current_pred_h2}
 
-timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --no_public)
+timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --no_public
+  --steps 30)
 [[ $size == tiny ]] && timing+=(--image_size 48 64 --batch_size 1 --steps 1)
 [[ $device == cpu ]] && timing+=(--precision fp32)
 graph=() && [[ $device == cuda ]] && graph=(--cuda_graph)
 
-# ms of a training step of each where three are trained at once; nothing if that fails.
-time_together() {
-  local steps=150 number
-  [[ $size == tiny ]] && steps=1
-  for number in 1 2 3; do
-    timeout --kill-after=1 60 "${timing[@]}" --steps "$steps" --predictions 0 "${graph[@]}" \
-      >"$work/together-$number.txt" 2>&1 &
-  done
-  wait
-  cat "$work"/together-*.txt >>"$out/log.txt"
-  awk -F '|' '/^\| ours/ { sum += $(NF - 1); found++ } END { if (found == 3) printf "%.1f", sum / 3 }' \
-    "$work"/together-*.txt
-}
-
 if [[ $steps == *tests* ]]; then
-  do_step tests 90 python3 -m pytest -m cuda -p no:cacheprovider \
-    -W default ${TESTS:-tests/policy tests/training}
+  do_step tests 90 python3 -m pytest -m cuda -n 4 --dist loadfile -p no:cacheprovider \
+    -W default tests/policy tests/training
   code=$?
   grep -E "^(FAILED|ERROR|E  )|passed|failed|skipped" "$out/log.txt" | tail -20
   ((code == 0)) || exit 1
@@ -50,20 +36,8 @@ if [[ $steps == *speed* ]]; then
   sed -n '/, torch /,$p' "$out/log.txt"
 fi
 
-# Seconds for what is beside training: demonstrations, their images, the end; and for each evaluation.
-beside=105 evaluation=25
-
 if [[ $steps == *paper* ]]; then
   share_gpu
-  if [[ -z $conditions ]]; then
-    together=$(time_together)
-    echo "three trainings at once: ${together:-failed} ms a step of each" | tee -a "$out/times.txt"
-    # So many, one at least, as 12 500 steps of each leave time for.
-    number=$(awk -v ms="${together:-60}" -v left=$(($(left) - beside)) -v each=$evaluation 'BEGIN {
-      n = int(left / (12.5 * ms / 3 + each)); print n < 1 ? 1 : n }')
-    conditions=$(printf '%s\n' baseline current_pred_h2 current | head -n "$number" | tr '\n' ' ')
-  fi
-  echo "conditions: $conditions" | tee -a "$out/times.txt"
   command=(python3 bin/Benchmark.py feeding --preset paper --device "$device" --conditions $conditions
     --num_workers "$(nproc)" --no_videos --out "$work/results/feeding_$size")
   if [[ $size == tiny ]]; then
@@ -76,7 +50,7 @@ if [[ $steps == *paper* ]]; then
   monitor=$!
   (while sleep 45; do pack; done) &
   packer=$!
-  do_step paper "$(($(left) - 10))" "${command[@]}"
+  do_step paper "$(($(left) - SAVING - 5))" "${command[@]}"
   kill $monitor $packer 2>/dev/null
   pack
   end_sharing
