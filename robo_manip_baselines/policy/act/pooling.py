@@ -1,8 +1,9 @@
 """Largest of 3x3 pixels, rectified, and its gradient, each in one kernel on a CUDA device.
 
-PyTorch's kernels for images whose channels lie side by side take four times as long, and keep eight
-bytes for each pixel to say which was the largest; these keep one. They are written in Triton, which
-PyTorch brings along on Linux; without it PyTorch's own do the work.
+PyTorch's own, for images whose channels lie side by side, take 1.5 of the 22 ms of a step at the
+paper's size (H200), and keep eight bytes for each pixel to say which was the largest. These keep
+one. They are written in Triton, which PyTorch brings along on Linux; without it PyTorch's own do
+the work.
 
 Legend: I images, H and W height and width before, h and w after, C channels.
 """
@@ -30,9 +31,6 @@ logger = logging.getLogger(__name__)
 PIXELS = 32
 """Pixels of a program of the GPU, with all of their channels."""
 
-_NONE = 9
-"""Stands for: no pixel of the nine is above 0."""
-
 _is_usable = triton is not None
 
 
@@ -59,12 +57,7 @@ class MaxPoolRelu(torch.autograd.Function):
         """Return (I, C, h, w) from (I, C, H, W), both with the channels last in memory."""
         count, channels, height, width = x.shape
         rows, columns = (height + 1) // 2, (width + 1) // 2
-        y = torch.empty_strided(
-            (count, channels, rows, columns),
-            (rows * columns * channels, 1, columns * channels, channels),
-            dtype=x.dtype,
-            device=x.device,
-        )
+        y = _empty(x, count, channels, rows, columns)
         place = torch.empty_like(y, dtype=torch.uint8)
         pixels = count * rows * columns
         sizes = height, width, rows, columns, pixels, channels, PIXELS
@@ -79,16 +72,17 @@ class MaxPoolRelu(torch.autograd.Function):
         (place,) = ctx.saved_tensors
         gradient = gradients[0].contiguous(memory_format=torch.channels_last)
         (count, channels, rows, columns), (height, width) = place.shape, ctx.size
-        found = torch.empty_strided(
-            (count, channels, height, width),
-            (height * width * channels, 1, width * channels, channels),
-            dtype=gradient.dtype,
-            device=gradient.device,
-        )
+        found = _empty(gradient, count, channels, height, width)
         pixels = count * height * width
         sizes = height, width, rows, columns, pixels, channels, PIXELS
         _backward_kernel[(triton.cdiv(pixels, PIXELS),)](gradient, place, found, *sizes)
         return found
+
+
+def _empty(like: Tensor, *shape: int) -> Tensor:
+    return torch.empty(
+        shape, dtype=like.dtype, device=like.device, memory_format=torch.channels_last
+    )
 
 
 def _forward(
@@ -109,7 +103,7 @@ def _forward(
     column, row = pixel % columns, pixel // columns % rows
     image = pixel // (columns * rows)
     best = tl.zeros((block, channels), tl.float32)
-    place = tl.full((block, channels), 9, tl.int32)
+    place = tl.full((block, channels), 9, tl.int32)  # of nine pixels: none is above 0
     for down in tl.static_range(3):
         for right in tl.static_range(3):
             y, x = 2 * row - 1 + down, 2 * column - 1 + right
@@ -117,7 +111,7 @@ def _forward(
             source = ((image * height + y) * width + x).to(tl.int64)[:, None] * channels
             source += channel[None, :]
             value = tl.load(x_ptr + source, mask=inside[:, None], other=0.0).to(tl.float32)
-            is_larger = value > best
+            is_larger = (value > best) | (value != value)  # not a number stays visible
             best = tl.where(is_larger, value, best)
             place = tl.where(is_larger, 3 * down + right, place)
     target = pixel.to(tl.int64)[:, None] * channels + channel[None, :]

@@ -136,6 +136,11 @@ def compare_pooling(device: str) -> None:
             ((expected,), (of_x,)) = (torch.autograd.grad(y, x, gradient) for y in (plain, found))
             # Four gradients add up, in another order and in fp32.
             assert_near(of_x, expected, 1e-6 if dtype == torch.float32 else 2e-2)
+    x = channels_last(draw(1, 8, 6, 6).to(device, torch.float32))
+    x[0, 3, 2, 2] = torch.nan
+    plain = torch.relu(nn.functional.max_pool2d(x, 3, 2, 1))
+    torch.testing.assert_close(MaxPoolRelu.apply(x), plain, equal_nan=True, rtol=0.0, atol=0.0)
+    assert plain.isnan().any()
 
 
 @pytest.mark.cuda
