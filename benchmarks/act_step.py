@@ -11,7 +11,7 @@ import copy
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, cast
 
@@ -36,7 +36,7 @@ from robo_manip_baselines.training.device import (  # noqa: E402
     prepare_device,
 )
 from robo_manip_baselines.training.state import TrainerState  # noqa: E402
-from robo_manip_baselines.training.step import LossModule, TrainingStep  # noqa: E402
+from robo_manip_baselines.training.step import LossModule, TrainingStep, map_batch  # noqa: E402
 
 PHASES = ("transfer", "forward", "backward", "optimiser")
 LEARNING_RATE = 1e-5
@@ -123,14 +123,8 @@ def make_batch(options: Options, size: int, as_float: bool) -> Batch:
         num_examples=torch.tensor(float(size)),
     )
     if options.where.type == "cuda":
-        batch = _map(batch, lambda value: value.pin_memory())
+        batch = map_batch(batch, lambda value: value.pin_memory())
     return batch
-
-
-def _map(batch: Batch, change: Callable[[Tensor], Tensor]) -> Batch:
-    """A batch with every tensor changed."""
-    values = {field.name: getattr(batch, field.name) for field in fields(batch)}
-    return replace(batch, **{k: None if v is None else change(v) for k, v in values.items()})
 
 
 def _copy(source: Batch, target: Batch) -> None:
@@ -168,9 +162,7 @@ class OurStep:
     """A step of training as the trainer does it."""
 
     def __init__(self, model: PolicyModel, options: Options) -> None:
-        settings = TrainSettings(
-            learning_rate=LEARNING_RATE, weight_decay=WEIGHT_DECAY, epochs=1, compile=False
-        )
+        settings = TrainSettings(learning_rate=LEARNING_RATE, weight_decay=WEIGHT_DECAY, epochs=1)
         loss: Any = LossModule(model)
         self.mark: Callable[[str], None] = lambda phase: None
         self.step = TrainingStep(
@@ -199,7 +191,7 @@ class TimedNetwork:
 
     def load(self) -> Batch:
         """Bring the batch from main memory."""
-        return _map(self.host_batch, lambda v: v.to(self.device, non_blocking=True))
+        return map_batch(self.host_batch, lambda v: v.to(self.device, non_blocking=True))
 
     def phases(self) -> list[float]:
         """Seconds of each phase of a step."""
@@ -236,7 +228,7 @@ def predictor(model: PolicyModel, options: Options, ours: bool) -> Callable[[], 
             torch.bfloat16 if options.precision == "bf16" else torch.float32
         )
     predict = torch.compile(model.predict) if ours and options.compile else model.predict
-    on_device = _map(batch, lambda value: value.to(device))
+    on_device = map_batch(batch, lambda value: value.to(device))
 
     @torch.inference_mode()
     def eager() -> Tensor:

@@ -93,7 +93,7 @@ class Options:
         detector_model: MediaPipe's face_landmarker.task, for image_only.
         resamples: Resamples of the intervals of each evaluation.
         memory_gb: Memory for decoded images of a training in GB.
-        only_times: Only measure processor times, on images at random: seconds.
+        only_times: Only measure processor times, of the preset cpu on images at random: seconds.
         out: Folder of runs, evaluations and tables.
     """
 
@@ -125,6 +125,8 @@ class Options:
             require_choice("split", split, SPLITS)
         for kind in self.kinds:
             require_choice("kind of footage", kind, KINDS)
+        if self.only_times and self.preset != "cpu":
+            raise RequestError("--only_times: measures the preset cpu; leave one of the two out")
         if self.size not in CHANNELS:
             sizes = ", ".join(map(str, CHANNELS))
             raise RequestError(f"--size {self.size}: unknown; valid: {sizes}")

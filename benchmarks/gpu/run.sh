@@ -15,8 +15,7 @@
 source "$(dirname "$0")/machine.sh"
 steps=${STEPS:-tests speed paper} conditions=${CONDITIONS:-baseline current current_pred_h2}
 
-timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --no_public
-  --steps 30)
+timing=(python3 benchmarks/act_step.py --device "$device" --threads 4 --no_public --steps 30)
 [[ $size == tiny ]] && timing+=(--image_size 48 64 --batch_size 1 --steps 1)
 [[ $device == cpu ]] && timing+=(--precision fp32)
 graph=() && [[ $device == cuda ]] && graph=(--cuda_graph)
@@ -33,6 +32,7 @@ if [[ $steps == *speed* ]]; then
   do_step "bf16" 40 "${timing[@]}" --predictions 50
   [[ $device == cuda ]] && do_step "bf16, CUDA graph" 60 "${timing[@]}" --cuda_graph --profile --predictions 50
   [[ $size == tiny ]] || do_step "fp32, CUDA graph" 60 "${timing[@]}" --precision fp32 "${graph[@]}"
+  [[ $size == tiny ]] || do_step "bf16, compiled, CUDA graph" 240 "${timing[@]}" --compile "${graph[@]}"
   sed -n '/, torch /,$p' "$out/log.txt"
 fi
 

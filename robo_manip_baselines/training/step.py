@@ -71,7 +71,7 @@ class TrainingStep:
         if self._replay is None:
             return self._compute(batch, self._timer.mark)
         if self._batch is None:
-            self._batch = _map(batch, torch.clone)
+            self._batch = map_batch(batch, torch.clone)
         else:
             for field in fields(Batch):
                 if (value := getattr(batch, field.name)) is not None:
@@ -157,6 +157,7 @@ def _foreach_copy(targets: list[Tensor], sources: list[Tensor]) -> None:
     torch._foreach_copy_(targets, sources)  # pyright: ignore[reportPrivateImportUsage]
 
 
-def _map(batch: Batch, change: Callable[[Tensor], Tensor]) -> Batch:
+def map_batch(batch: Batch, change: Callable[[Tensor], Tensor]) -> Batch:
+    """Return the batch with every tensor changed."""
     values = {field.name: getattr(batch, field.name) for field in fields(batch)}
     return replace(batch, **{k: None if v is None else change(v) for k, v in values.items()})

@@ -177,3 +177,8 @@ def test_bad_requests(approaches, tmp_path: Path, monkeypatch, words, message) -
     with pytest.raises(RequestError, match=message):
         run(approaches, monkeypatch, tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()
+
+
+def test_times_are_of_the_preset_for_a_processor(approaches: ModuleType) -> None:
+    with pytest.raises(RequestError, match="--only_times: measures the preset cpu"):
+        approaches.Options(only_times=True, preset="paper")
