@@ -145,11 +145,14 @@ class TrainConfig(Generic[Network]):
         return dataclasses.replace(config, **changes)
 
     @property
+    def name(self) -> str:
+        """Policy, condition, preset and seed, such as ``act_current_pred_h2_cpu_seed0``."""
+        return f"{self.policy.lower()}_{self.spec.name}_{self.preset}_seed{self.seed}"
+
+    @property
     def folder(self) -> Path:
         """Run folder."""
-        if self.out is not None:
-            return self.out
-        return Path(f"runs/{self.policy.lower()}_{self.spec.name}_{self.preset}_seed{self.seed}")
+        return self.out or Path("runs") / self.name
 
     @property
     def demonstrations(self) -> Path:

@@ -114,7 +114,7 @@ def _train(
                 return EXIT_INTERRUPTED
         if processes.is_main:
             run = config.folder
-            if write_curves(run / CURVES, read_metrics(run / METRICS), run.resolve().name):
+            if write_curves(run / CURVES, read_metrics(run / METRICS), config.name):
                 logger.info("curves: %s", run / CURVES)
             else:
                 logger.info("no image of the curves; run: %s", pip_install("matplotlib"))

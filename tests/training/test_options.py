@@ -258,6 +258,10 @@ def test_run_folders(line: str, folder: str) -> None:
     assert parse(line).folder == Path(folder)
 
 
+def test_a_run_is_called_what_it_trains_wherever_it_lies() -> None:
+    assert parse("Act --preset cpu --seed 3 --out x/y").name == "act_current_pred_h2_cpu_seed3"
+
+
 @pytest.mark.parametrize(
     ("line", "parts"),
     [
