@@ -27,9 +27,10 @@ from robo_manip_baselines.rollout.demonstrate import Collection, collect
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import decode_image
+from robo_manip_baselines.runs.threads import processors
 from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler
 from robo_manip_baselines.training.device import choose_device
-from robo_manip_baselines.training.images import ImageStore, processors
+from robo_manip_baselines.training.images import ImageStore
 
 EXAMPLE = "python benchmarks/batch_loading.py --batch_size 8 --image_size 240x320"
 

@@ -6,7 +6,6 @@ where and in which order they were done.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -47,6 +46,7 @@ from robo_manip_baselines.runs.files import (
     write_text,
 )
 from robo_manip_baselines.runs.progress import closing_table
+from robo_manip_baselines.runs.threads import processors
 
 REPORT = "report.html"
 VERSIONS = "versions.json"
@@ -118,7 +118,7 @@ def write_aggregation(
             for path in store.outputs(item).values()
             if path.suffix == ".mp4"
         ]
-        with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV and OpenCV let go of the GIL
+        with ThreadPoolExecutor(processors()) as pool:  # PyAV and OpenCV let go of the GIL
             clips = list(pool.map(lambda video: read_video(*video), drawn))
         facts = {"Command": command}
         if any(run.training for run in plan.runs):

@@ -25,6 +25,7 @@ from robo_manip_baselines.observation.corruption import MEASURED_ERRORS
 from robo_manip_baselines.observation.error_stats import load_error_stats
 from robo_manip_baselines.observation.spec import ImageSize
 from robo_manip_baselines.policy.checkpoint import ACTING_FILES, read_checkpoint
+from robo_manip_baselines.policy.presets import TrainSettings
 from robo_manip_baselines.rollout.demonstrate import Collection
 from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
 from robo_manip_baselines.rollout.results import EpisodeResult
@@ -263,22 +264,22 @@ class Plan:
         default = TrainConfig.from_preset(condition.policy, preset.train_preset, env=self.env)
         known = default.to_json()
         settings = {name: v for name, v in preset.train_settings.items() if name in known}
-        if settings.keys() & BUDGET_OPTIONS:  # in place of the policy's own
-            settings = {**dict.fromkeys(BUDGET_OPTIONS), **settings}
-        settings |= {
+        settings = {**dict.fromkeys(BUDGET_OPTIONS), **in_place_of(known, settings)} | {
             "seed": train_seed,
             "device": preset.device,
             "logger": "none",
             "dataset": MOUNTS["demonstrations"],
             "out": OUT,
         }
-        config = TrainConfig.from_json({**known, **settings})
+        config = TrainConfig.from_json(settings)
         spec = condition.observation(config.spec)
         files = self._files()
         if self.error_stats and spec.corruption.error in MEASURED_ERRORS:
             spec = replace(spec, corruption=replace(spec.corruption, error_stats=STATS))
             files[STATS] = self.error_stats
         config = replace(config, spec=spec)
+        if preset.cameras and preset.device == "cpu":
+            config = replace(config, training=_with_one_precision(config.training))
         run = PlannedRun(condition, train_seed, None, ())
         settings = {"config": config.to_json()}
         training = self._item("training", run.name, "run_training", settings, files)
@@ -384,7 +385,8 @@ def make_plan(
 
     Raises:
         RequestError: a file cannot be used, a condition needs predictions that the library lacks or
-            errors further ahead than the statistics go, or its people cannot be split.
+            errors further ahead than the statistics go, its people cannot be split, or a trained
+            policy is evaluated on other people or another face than were declared.
     """
     motion, file = MotionLibrary.load(library), library_file(library)
     for condition in conditions:
@@ -396,6 +398,7 @@ def make_plan(
     stats = load_error_stats(error_stats)
     for condition in conditions:
         if condition.checkpoint:  # has statistics of its own
+            _require_declared(condition, people, face)
             continue
         if condition.spec.corruption.error in MEASURED_ERRORS:
             try:
@@ -414,6 +417,23 @@ def make_plan(
     )
 
 
+def _require_declared(condition: ConditionConfig, people: DrawnPeople, face: str) -> None:
+    """Refuse a trained policy that brings along people or a face that were not declared."""
+    recorded = read_checkpoint(condition.checkpoint).dataset.get("env_kwargs", {})
+    drawn = "test" if recorded.get("people") == "train" else recorded.get("people", "all")
+    if not people and drawn != people.evaluation:
+        raise RequestError(
+            f"condition '{condition.name}': its policy is evaluated on the people '{drawn}', of "
+            "whom it has no demonstrations; say people: {demonstrations: train, evaluation: "
+            f"{drawn}}}"
+        )
+    if face == FACES[0] != (own := recorded.get("face", FACES[0])):
+        raise RequestError(
+            f"condition '{condition.name}': its policy learnt from a {own} face, this benchmark "
+            f"has the {face} one; say face: {own}"
+        )
+
+
 def missing_predictions(condition: ConditionConfig, library: MotionLibrary) -> str:
     """Return why a condition lacks a predictor's output in the library; empty if it does not."""
     spec, frames = condition.spec, library.predicted_frames
@@ -429,6 +449,22 @@ def missing_predictions(condition: ConditionConfig, library: MotionLibrary) -> s
         f"'{library.source}' {lacking}; give a library with --motion_library that "
         "'python -m face_prediction predict' wrote, or leave the condition out"
     )
+
+
+def in_place_of(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of a training with changes; a budget takes the place of the other one."""
+    gone = BUDGET_OPTIONS if changes.keys() & BUDGET_OPTIONS else ()
+    return {name: value for name, value in settings.items() if name not in gone} | {**changes}
+
+
+def _with_one_precision(training: TrainSettings) -> TrainSettings:
+    """Return settings without ``auto``, which is another precision on another node."""
+    import torch  # slow to import
+
+    from robo_manip_baselines.training.device import autocast_type
+
+    found = autocast_type(training.precision, torch.device("cpu"), has_images=True)
+    return replace(training, precision="fp32" if found is None else "bf16")
 
 
 def _blocks(first: int, count: int, size: int) -> list[range]:

@@ -23,7 +23,7 @@ from robo_manip_baselines.benchmark.work_item import (
     WorkItem,
     read_manifest,
 )
-from robo_manip_baselines.benchmark.worker import end_worker, last_line, start_worker
+from robo_manip_baselines.benchmark.worker import end_worker, failure, start_worker
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.extras import install_command
 
@@ -139,7 +139,7 @@ class RayExecutor:
             self.start(item)
             return None
         if code:
-            return WorkResult(item, last_line(log) or f"exit code {code}", code)
+            return WorkResult(item, failure(code, log), code)
         self._store.commit(item, files, seconds, log)
         return WorkResult(item)
 

@@ -12,7 +12,7 @@ from statistics import fmean
 from typing import Protocol
 
 from robo_manip_baselines.benchmark.work_item import LOG, ArtifactStore, WorkItem
-from robo_manip_baselines.benchmark.worker import end_worker, last_line, start_worker
+from robo_manip_baselines.benchmark.worker import end_worker, failure, start_worker
 from robo_manip_baselines.runs.command import EXIT_WRONG_REQUEST
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.progress import ProgressBar, duration
@@ -119,8 +119,8 @@ class LocalExecutor:
         if process.returncode == 0 and self._store.is_done(item):
             return WorkResult(item)
         log = self._store.folder(item) / LOG
-        last = last_line(log.read_text(encoding="utf-8", errors="replace"))
-        problem = f"{last or f'exit code {process.returncode}'} (all of it: {log})"
+        text = log.read_text(encoding="utf-8", errors="replace")
+        problem = f"{failure(process.returncode, text)} (all of it: {log})"
         return WorkResult(item, problem, process.returncode)
 
 

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from robo_manip_baselines.benchmark.work_item import (
@@ -29,7 +30,6 @@ from robo_manip_baselines.benchmark.work_item import (
     write_manifest,
 )
 from robo_manip_baselines.data.files import seed_of
-from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.documents import parse_json
 from robo_manip_baselines.runs.errors import RequestError
@@ -91,10 +91,12 @@ def end_worker(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def last_line(log: str) -> str:
-    """Return the last line of a log that is not empty."""
+def failure(code: int, log: str) -> str:
+    """Return why a worker ended with an exit code: in its last words, where it had any."""
+    if code < 0:  # no words of its own: the last line is of earlier work
+        return f"killed by signal {-code}, perhaps for lack of memory; fewer workers need less"
     lines = [line.strip() for line in log.splitlines() if line.strip()]
-    return lines[-1].removeprefix("error: ") if lines else ""
+    return lines[-1].removeprefix("error: ") if lines else f"exit code {code}"
 
 
 def run_demonstrations(settings: Mapping[str, Any]) -> None:
@@ -152,7 +154,7 @@ def main() -> int:
             if file_digest(folder / name) != digest:
                 raise RequestError(f"{name} was changed since the benchmark began; start it again")
         begin = time.perf_counter()
-        function: Function = load_part(request["function"])
+        function: Function = resolve_name(request["function"])
         if code := function(request["settings"]):
             return code
         for name in MOUNTS.values():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import shlex
 import sys
@@ -34,6 +33,7 @@ from robo_manip_baselines.benchmark.plan import (
     PRESETS,
     BenchmarkPreset,
     Plan,
+    in_place_of,
     make_plan,
     missing_predictions,
 )
@@ -55,6 +55,7 @@ from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import prepare_folder, require_out_folder
 from robo_manip_baselines.runs.progress import closing_table, duration
 from robo_manip_baselines.runs.ranges import Episodes, require_ranges
+from robo_manip_baselines.runs.threads import processors
 from robo_manip_baselines.runs.versions import source_digest
 from robo_manip_baselines.training.config import TrainConfig
 from robo_manip_baselines.training.requirements import prepare_pytorch
@@ -161,9 +162,15 @@ class BenchmarkOptions:
         names = "train_seeds", "num_episodes", "demonstrations", "device"
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         preset = PRESETS[self.preset]
-        settings = parse_settings(self.train_settings, "--train_settings")
-        settings = {**preset.train_settings, **changes.train_settings, **settings}
-        return replace(preset, train_settings=settings, **{**changes.given(), **given})
+        settings = in_place_of(preset.train_settings, changes.train_settings)
+        own = parse_settings(self.train_settings, "--train_settings")
+        size = replace(
+            preset,
+            train_settings=in_place_of(settings, own),
+            **{**changes.given(), **given},
+        )
+        share = 0.0 if size.device == "cpu" else preset.gpu_share or 1.0
+        return replace(size, gpu_share=share)
 
     @property
     def folder(self) -> Path:
@@ -187,10 +194,7 @@ class BenchmarkOptions:
     @property
     def workers(self) -> int:
         """Number of work items that run at once on this machine."""
-        cores = os.cpu_count() or 1
-        if hasattr(os, "sched_getaffinity"):
-            cores = len(os.sched_getaffinity(0))
-        return self.num_workers or max(cores // self.size.threads, 1)
+        return self.num_workers or max(processors() // self.size.threads, 1)
 
 
 def parse_options(args: Sequence[str]) -> BenchmarkOptions:
@@ -231,10 +235,11 @@ def benchmark(options: BenchmarkOptions) -> int:
             *(others, len(items), store.root),
         )
     if options.dry_run:
-        print(overview(plan, items, store, options.workers))  # noqa: T201
+        workers = options.workers if options.executor == "local" else None
+        print(overview(plan, items, store, workers))  # noqa: T201
         return 0
     if options.executor == "local":
-        _require_device(options.preset, plan)
+        _require_device(plan)
     prepare_folder(options.folder)
     logger.info("%s, preset %s, in %s", options.benchmark, options.preset, options.folder)
     try:
@@ -326,11 +331,13 @@ def carry_out(
     print(closing_summary(statistics, options.folder))  # noqa: T201
 
 
-def overview(plan: Plan, items: Sequence[WorkItem], store: ArtifactStore, workers: int) -> str:
-    """Lay out what there is to do."""
+def overview(
+    plan: Plan, items: Sequence[WorkItem], store: ArtifactStore, workers: int | None
+) -> str:
+    """Lay out what there is to do, and the time that so many workers take, None if unknown."""
     total = Counter(item.kind for item in items)
     left = Counter(item.kind for item in items if not store.is_done(item))
-    progress = GridProgress(items, workers, bar=False)
+    progress = GridProgress(items, workers or 1, bar=False)
     seconds = _count_done(progress, items, store)
     rows = {
         "conditions": ", ".join(condition.name for condition in plan.conditions),
@@ -339,9 +346,10 @@ def overview(plan: Plan, items: Sequence[WorkItem], store: ArtifactStore, worker
         "face": plan.face,
         **{kind: f"{left[kind]} of {count} items to do" for kind, count in total.items()},
         "done": f"{duration(seconds)} of work, videos apart",
-        "workers": str(workers),
-        "time": f"about {duration(progress.seconds_left)}, videos apart",
     }
+    if workers:
+        rows["workers"] = str(workers)
+        rows["time"] = f"about {duration(progress.seconds_left)}, videos apart"
     return closing_table(rows)
 
 
@@ -355,16 +363,16 @@ def _count_done(progress: GridProgress, items: Iterable[WorkItem], store: Artifa
     return total
 
 
-def _require_device(preset: str, plan: Plan) -> None:
-    """Refuse a preset whose trainings cannot run here, before an hour of demonstrations."""
+def _require_device(plan: Plan) -> None:
+    """Refuse a size whose trainings cannot run here, before an hour of demonstrations."""
     if plan.preset.device == "cpu":
         return
     import torch  # slow to import
 
     if not torch.cuda.is_available():
         raise RequestError(
-            f"preset '{preset}' needs a CUDA device, and PyTorch {torch.__version__} finds none; "
-            "take --preset cpu, or --executor ray with a cluster that has GPUs"
+            f"a CUDA device is needed, and PyTorch {torch.__version__} finds none; take --preset cpu "
+            "without --device, or --executor ray with a cluster that has GPUs"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import shlex
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -32,6 +31,7 @@ from robo_manip_baselines.runs.errors import require_choice
 from robo_manip_baselines.runs.files import locked, require_out_folder
 from robo_manip_baselines.runs.progress import ProgressBar, closing_table, duration
 from robo_manip_baselines.runs.ranges import Episodes, require_ranges
+from robo_manip_baselines.runs.threads import processors
 
 DESCRIPTION = """Let a scripted visual servo feed people who move, over delays, leads, ways to
 execute its plans and forecasters, and write tables, figures and a page. The same command continues
@@ -94,9 +94,7 @@ class ForesightOptions:
     @property
     def workers(self) -> int:
         """Number of processes."""
-        if self.num_workers is not None:
-            return self.num_workers
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        return self.num_workers if self.num_workers is not None else processors()
 
 
 def foresight(options: ForesightOptions, command: str) -> int:

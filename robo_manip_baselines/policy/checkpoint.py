@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from typing_extensions import TypedDict
@@ -25,7 +26,7 @@ from robo_manip_baselines.policy.presets import (
     PolicyDims,
     TrainSettings,
 )
-from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry
+from robo_manip_baselines.policy.registry import make_model, policy_entry
 from robo_manip_baselines.runs.checkpoints import (
     checkpoint_folder,
     find_checkpoint,
@@ -193,7 +194,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     try:
         stored = read_json(verify(folder, digests, CONFIG), CheckpointDocument)
         stats = read_json(verify(folder, digests, STATS))
-        network = load_part(policy_entry(stored.policy).config)
+        network = resolve_name(policy_entry(stored.policy).config)
         checkpoint = Checkpoint(
             folder=folder,
             config=convert(stored.config, network, "config"),

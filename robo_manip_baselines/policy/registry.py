@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.metadata import entry_points
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
-from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.memory import free_memory
 
@@ -106,7 +106,7 @@ def policy_presets(name: str) -> dict[str, PolicyPreset]:
     Raises:
         RequestError: there is no such policy.
     """
-    return load_part(policy_entry(name).presets)
+    return resolve_name(policy_entry(name).presets)
 
 
 def make_model(name: str, config: Any, dims: PolicyDims) -> PolicyModel:
@@ -117,7 +117,7 @@ def make_model(name: str, config: Any, dims: PolicyDims) -> PolicyModel:
             network does not fit into memory.
     """
     require_memory(name, config, dims)
-    return load_part(policy_entry(name).model)(config, dims)
+    return resolve_name(policy_entry(name).model)(config, dims)
 
 
 def require_memory(name: str, config: Any, dims: PolicyDims, copies: int = 1) -> None:

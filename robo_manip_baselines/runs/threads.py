@@ -1,4 +1,4 @@
-"""Waiting of OpenMP's threads for one another, chosen by the load of the cores."""
+"""The cores of this process, and how OpenMP's threads wait for one another on them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,13 @@ LOOK = 0.1
 
 TAKEN = 0.5
 """Share of its time for which a core works before it counts as taken by another program."""
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def choose_waiting() -> None:

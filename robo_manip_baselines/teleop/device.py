@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from pkgutil import resolve_name
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
-from robo_manip_baselines.envs.mujoco.tasks.registry import load_part
 from robo_manip_baselines.runs.errors import require_choice
 
 Floats = NDArray[np.float64]
@@ -174,4 +174,4 @@ def make_device(name: str, **kwargs: Any) -> TeleopDevice:
     Raises:
         RequestError: there is no such device, or it cannot be opened; says what to do.
     """
-    return load_part(DEVICES[require_choice("device", name, DEVICES)])(**kwargs)
+    return resolve_name(DEVICES[require_choice("device", name, DEVICES)])(**kwargs)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +25,7 @@ from robo_manip_baselines.runs.images import decode_image
 from robo_manip_baselines.runs.memory import free_memory
 from robo_manip_baselines.runs.progress import track
 from robo_manip_baselines.runs.shared_arrays import SharedArray, shared_array
+from robo_manip_baselines.runs.threads import processors
 from robo_manip_baselines.runs.versions import source_digest
 
 Images = NDArray[np.uint8]
@@ -165,13 +165,6 @@ def _key(demonstrations: Demonstrations) -> str:
     size = spec.image_size, spec.drawn_size
     parts = demonstrations.content_hash, spec.cameras, size, source_digest()
     return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-def processors() -> int:
-    """Return how many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):  # Linux
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _decode(data: Images, out: Images, path: Path, camera: str, step: int) -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from robo_manip_baselines.policy.checkpoint import (
     without_initial_weights,
 )
 from robo_manip_baselines.policy.interface import PolicyDims, PolicyModel
-from robo_manip_baselines.policy.registry import load_part, make_model, policy_entry, require_memory
+from robo_manip_baselines.policy.registry import make_model, policy_entry, require_memory
 from robo_manip_baselines.runs.checkpoints import list_checkpoints, remove_partial_checkpoints
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.metrics import (
@@ -99,7 +100,7 @@ class TrainSetup:
         step = settings.skip * given.control_period
         encoding = ActionEncoding(given.spec, step, settings.relative_actions)
         if config.init_from is None:
-            normalize = METHODS.get(config.norm) or load_part(config.norm)
+            normalize = METHODS.get(config.norm) or resolve_name(config.norm)
             actions = _encoded_actions(config, given, encoding, train)
             normalization = normalize(given.state[given.rows(train)], actions)
         else:

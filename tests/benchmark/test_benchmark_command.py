@@ -28,6 +28,7 @@ from robo_manip_baselines.commands.benchmark import (
 from robo_manip_baselines.envs.mujoco.face.motion import DEFAULT_LIBRARY, PREDICTION
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.versions import source_digest
+from robo_manip_baselines.training import device as device_module
 
 from .conftest import CONDITIONS as STUB_CONDITIONS
 from .conftest import PRESET, contents
@@ -91,7 +92,7 @@ def test_a_preset_for_a_gpu_is_refused_where_there_is_none(
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     line = "feeding --preset paper" + " --shard 1/2" * has_shard
-    with pytest.raises(RequestError, match="'paper' needs a CUDA device"):
+    with pytest.raises(RequestError, match="a CUDA device is needed"):
         benchmark(options(f"{line} --out {tmp_path / 'out'}"))
     assert not (tmp_path / "out").exists()
 
@@ -142,6 +143,31 @@ def test_a_condition_that_cannot_be_had_is_left_out_unless_it_is_named(
     assert len(plan_of(options(f"feeding --motion_library {DEFAULT_LIBRARY}")).conditions) == 16
     late = plan_of(options(f"foresight_policies --motion_library {bare}")).conditions
     assert len(late) == 31  # others than `residual` of the library
+
+
+def test_a_budget_takes_the_place_of_another_one_and_a_device_of_its_share() -> None:
+    given = options("feeding --preset smoke --train_settings epochs=5").size.train_settings
+    assert given == {"hidden_size": 64, "feedforward_size": 128, "epochs": 5}
+    training = plan_of(options("foresight_policies --train_settings epochs=5")).runs[0].training
+    assert training
+    assert [training.settings["config"][name] for name in ("steps", "epochs")] == [None, 5]
+    assert options("feeding --preset paper").size.gpu_share == 0.125
+    assert options("feeding --preset paper --device cpu").size.gpu_share == 0.0
+    assert options("feeding --preset cpu --device cuda").size.gpu_share == 1.0
+
+
+def test_the_precision_of_images_is_decided_once_for_all_nodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for is_fast, precision in ((True, "bf16"), (False, "fp32")):
+        monkeypatch.setattr(device_module, "_has_fast_bf16", lambda is_fast=is_fast: is_fast)
+        plan = plan_of(options("feeding --preset cpu_images --conditions current"))
+        training = plan.runs[0].training
+        assert training
+        assert training.settings["config"]["precision"] == precision
+    without_images = plan_of(options("feeding --conditions current")).runs[0].training
+    assert without_images
+    assert without_images.settings["config"]["precision"] == "auto"
 
 
 def test_a_file_may_have_other_numbers_than_the_preset(tmp_path: Path) -> None:

@@ -140,6 +140,18 @@ def test_the_last_words_of_a_unit_that_fails_are_passed_on(
 
 
 @pytest.mark.parametrize(
+    ("code", "log", "words"),
+    [
+        (1, "step 3\nerror: no room\n\n", "no room"),
+        (1, "", "exit code 1"),
+        (-9, "device: cpu\n", "killed by signal 9, perhaps for lack of memory"),
+    ],
+)
+def test_a_worker_that_was_killed_has_no_last_words(code: int, log: str, words: str) -> None:
+    assert worker.failure(code, log).startswith(words)
+
+
+@pytest.mark.parametrize(
     ("other", "words"),
     [
         ({"versions": {"mujoco": "1.2.3"}}, "here and 1.2.3 where the benchmark was started"),

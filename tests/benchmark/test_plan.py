@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from robo_manip_baselines.benchmark import plan as plan_module
 from robo_manip_baselines.benchmark import work_item as item_module
 from robo_manip_baselines.benchmark.conditions import (
     CONDITIONS,
@@ -43,8 +44,8 @@ def changed(**values: object) -> ConditionConfig:
     return ConditionConfig.from_yaml({"name": "b", **values})
 
 
-def plan(*conditions: ConditionConfig, preset: BenchmarkPreset = PRESET, **files: Path) -> Plan:
-    return make_plan("FeedingEnv", conditions or (CURRENT, AHEAD), preset, **files)
+def plan(*conditions: ConditionConfig, preset: BenchmarkPreset = PRESET, **given: Any) -> Plan:
+    return make_plan("FeedingEnv", conditions or (CURRENT, AHEAD), preset, **given)
 
 
 def keys(made: Plan, kind: str) -> list[str]:
@@ -310,7 +311,7 @@ def test_the_demo_only_evaluates_and_on_motion_of_other_people() -> None:
 
 
 def test_a_trained_policy_stands_beside_one_that_is_trained() -> None:
-    made = plan(CURRENT, trained())
+    made = plan(CURRENT, trained(), people=DEMO.people)
     kinds = [item.kind for item in made.items()]
     assert {kind: kinds.count(kind) for kind in kinds} == {
         "demonstrations": 2,
@@ -318,7 +319,7 @@ def test_a_trained_policy_stands_beside_one_that_is_trained() -> None:
         "evaluation": 4,
     }
     # Work of earlier benchmarks keeps its keys.
-    assert keys(made, "evaluation")[:2] == keys(plan(CURRENT), "evaluation")
+    assert keys(made, "evaluation")[:2] == keys(plan(CURRENT, people=DEMO.people), "evaluation")
     assert made.items((2, 2)) == made.runs[1].evaluations
     result = EpisodeResult("FeedingEnv", 1004, True, True, 4.0, 600, "", "c", "p")
     video = made.video(replace(result, condition="shipped", train_seed=0))
@@ -329,11 +330,12 @@ def test_a_trained_policy_stands_beside_one_that_is_trained() -> None:
 def test_other_weights_make_another_item(tmp_path: Path) -> None:
     source = SHIPPED / "current"
     shutil.copytree(source, tmp_path / "copy")
-    same = plan(trained(checkpoint=str(tmp_path / "copy")))
-    assert keys(same, "evaluation") == keys(plan(trained()), "evaluation")
-    other = plan(trained(checkpoint="shipped:baseline"))
+    same = plan(trained(checkpoint=str(tmp_path / "copy")), people=DEMO.people)
+    assert keys(same, "evaluation") == keys(plan(trained(), people=DEMO.people), "evaluation")
+    other = plan(trained(checkpoint="shipped:baseline"), people=DEMO.people)
     assert not {*keys(other, "evaluation")} & {*keys(same, "evaluation")}
-    assert keys(plan(trained(motion="sway")), "evaluation") != keys(same, "evaluation")
+    swaying = plan(trained(motion="sway"), people=DEMO.people)
+    assert keys(swaying, "evaluation") != keys(same, "evaluation")
 
 
 def test_the_motion_of_a_trained_policy_is_that_of_its_demonstrations() -> None:
@@ -363,15 +365,30 @@ def test_what_does_not_go_with_a_checkpoint_is_refused(
 
 def test_a_checkpoint_is_of_one_task_and_not_of_the_paper() -> None:
     with pytest.raises(RequestError, match="of the paper"):
-        plan(trained(name="current", motion="recorded"))
+        plan(trained(name="current", motion="recorded"), people=DEMO.people)
     other = replace(task_entry("FeedingEnv"), name="OtherEnv")
     with pytest.raises(RequestError, match="was trained in FeedingEnv, not in OtherEnv"):
         trained().for_task(other)
 
 
+def test_a_trained_policy_brings_no_people_and_no_face_that_were_not_declared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(RequestError, match=r"people 'test'.*say people: \{demonstrations: train"):
+        plan(trained())
+    checkpoint = replace(
+        read_checkpoint("shipped:current"), dataset={"env_kwargs": {"face": "physical"}}
+    )
+    monkeypatch.setattr(plan_module, "read_checkpoint", lambda _: checkpoint)
+    with pytest.raises(RequestError, match=r"from a physical face.*say face: physical"):
+        plan(trained())
+    assert plan(trained(), face="physical").runs
+
+
 @pytest.mark.long
 def test_the_item_of_a_trained_policy_acts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (item,) = plan(trained(), preset=replace(PRESET, num_episodes=1)).items()
+    size = replace(PRESET, num_episodes=1)
+    (item,) = plan(trained(), preset=size, people=DEMO.people).items()
     folder = ArtifactStore(tmp_path).prepare(item)
     settings = json.loads(json.dumps(item.settings))
     settings["config"]["env_kwargs"]["max_episode_steps"] = 20

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import replace
+from pkgutil import resolve_name
 
 import pytest
 import torch
@@ -12,7 +13,6 @@ from robo_manip_baselines.data.normalization import METHODS
 from robo_manip_baselines.policy.execution import TILE
 from robo_manip_baselines.policy.interface import Batch, PolicyDims, PolicyModel
 from robo_manip_baselines.policy.registry import (
-    load_part,
     make_model,
     policy_entry,
     policy_names,
@@ -61,9 +61,9 @@ every_policy = pytest.mark.parametrize("policy", policy_names())
 def test_presets_make_networks_that_fit(policy: str) -> None:
     entry, presets = policy_entry(policy), policy_presets(policy)
     assert presets
-    assert callable(METHODS.get(entry.normalization) or load_part(entry.normalization))
+    assert callable(METHODS.get(entry.normalization) or resolve_name(entry.normalization))
     for name, preset in presets.items():
-        assert isinstance(preset.config, load_part(entry.config))
+        assert isinstance(preset.config, resolve_name(entry.config))
         with torch.device("meta"):  # without numbers
             model = make_model(policy, preset.config, dims_of(policy, name))
         assert isinstance(model, PolicyModel)

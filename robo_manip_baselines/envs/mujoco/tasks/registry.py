@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from importlib import import_module
 from importlib.metadata import entry_points
 from inspect import Parameter, signature
+from pkgutil import resolve_name
 from typing import Any, Literal, Protocol
 
 import gymnasium
@@ -324,11 +324,11 @@ class TaskEntry:
         Raises:
             RequestError: there is no such expert.
         """
-        return load_part(self.experts[require_choice("expert", name, self.experts)])(env)
+        return resolve_name(self.experts[require_choice("expert", name, self.experts)])(env)
 
     def make_metrics(self) -> EpisodeMetrics:
         """Make the metrics of one episode."""
-        return load_part(self.metrics)()
+        return resolve_name(self.metrics)()
 
     def require_forecasts(self, spec: ObservationSpec) -> None:
         """Require that the target is the mouth, which is what is forecast, if forecasts are shown.
@@ -350,13 +350,7 @@ class TaskEntry:
 
     def load_study(self) -> TaskStudy:
         """Return published results, claims and figures."""
-        return load_part(self.study) if self.study else TaskStudy()
-
-
-def load_part(reference: str) -> Any:
-    """Import the object that ``module:name`` refers to."""
-    module, _, name = reference.partition(":")
-    return getattr(import_module(module), name)
+        return resolve_name(self.study) if self.study else TaskStudy()
 
 
 @cache
@@ -380,7 +374,7 @@ def task_entry(name: str) -> TaskEntry:
     if name == IMPORTED:
         return imported_entry()
     references = _references() | TASKS
-    return load_part(references[require_choice("environment", name, references)])
+    return resolve_name(references[require_choice("environment", name, references)])
 
 
 def entry_of_id(env_id: str) -> TaskEntry:
@@ -461,7 +455,7 @@ def env_kwargs_problem(task: TaskEntry | None, kwargs: object) -> str:
         return f"must be an object with names of arguments, not {str(kwargs)[:80]!r}"
     unknown = sorted(str(name) for name in kwargs if name not in ENV_ARGUMENTS)
     if unknown and task is not None and task.env:
-        known = signature(load_part(task.env)).parameters
+        known = signature(resolve_name(task.env)).parameters
         unknown = [
             name
             for name in unknown
