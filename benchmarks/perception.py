@@ -18,10 +18,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import time as clock
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -41,9 +41,10 @@ from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERAN
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env, task_entry
 from robo_manip_baselines.observation import FRAME_PERIOD
 from robo_manip_baselines.rollout.results import Proportion
+from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import AppendFile, atomic_file, write_json, write_text
-from robo_manip_baselines.runs.processes import Worker, close_workers, wait_for
+from robo_manip_baselines.runs.processes import answers
 from robo_manip_baselines.runs.versions import software_versions
 
 SOFTWARE = ("mujoco", "numpy", "robo_manip_baselines")
@@ -207,31 +208,16 @@ def run(options: argparse.Namespace) -> list[Row]:
     conditions = [name for name in options.conditions if not is_left_out(name)]
     todo = deque(remaining(conditions, options.episodes, done))
     options.out.mkdir(parents=True, exist_ok=True)
-    file = AppendFile(path, is_flushed=True)
-    workers: list[Worker] = []
-    busy: list[Worker] = []
 
-    def next_for(worker: Worker) -> None:
-        if todo and not (options.limit and clock.perf_counter() - begun > options.limit):
-            worker.submit(todo.popleft())
-            busy.append(worker)
+    def requests() -> Iterator[tuple[str, int]]:
+        while todo and not (options.limit and clock.perf_counter() - begun > options.limit):
+            yield todo.popleft()
 
-    is_done = False
-    try:
-        for _ in range(min(options.workers, len(todo))):
-            workers.append(Worker(Player))
-            next_for(workers[-1])
-        while busy:
-            for worker in wait_for(busy):
-                busy.remove(worker)
-                row: Row = worker.receive()
-                done[row.condition, row.seed] = row
-                file.append(f"{json.dumps(asdict(row))}\n".encode())
-                next_for(worker)
-        is_done = True
-    finally:
-        file.close()
-        close_workers(workers, at_once=not is_done)
+    rows: Generator[Row] = answers(Player, (), requests(), options.workers)
+    with closing(AppendFile(path, is_flushed=True)) as file, closing(rows):
+        for row in rows:
+            done[row.condition, row.seed] = row
+            file.append(f"{json.dumps(asdict(row))}\n".encode())
     if todo:
         print("time is up; the same command goes on", flush=True)
     return [done[key] for key in sorted(done)]
@@ -539,7 +525,7 @@ def main() -> None:
         return
     rows = run(options)
     if not rows:
-        sys.exit("no episode was played")
+        raise RequestError("no episode was played")
     text = tables(rows)
     write_text(options.out / "tables.md", text)
     write_json(options.out / "versions.json", software_versions(*SOFTWARE, "mediapipe"))
@@ -548,4 +534,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -371,8 +371,8 @@ def _require_device(plan: Plan) -> None:
 
     if not torch.cuda.is_available():
         raise RequestError(
-            f"a CUDA device is needed, and PyTorch {torch.__version__} finds none; take --preset cpu "
-            "without --device, or --executor ray with a cluster that has GPUs"
+            f"a CUDA device is needed, and PyTorch {torch.__version__} finds none; take --preset "
+            "cpu without --device, or --executor ray with a cluster that has GPUs"
         )
 
 

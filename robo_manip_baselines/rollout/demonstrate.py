@@ -6,7 +6,7 @@ import contextlib
 import logging
 import multiprocessing
 import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -51,15 +51,12 @@ from robo_manip_baselines.runs.documents import as_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder, write_json
 from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY, encode_image
-from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
+from robo_manip_baselines.runs.processes import answers
 from robo_manip_baselines.runs.progress import EpisodeProgress
 from robo_manip_baselines.runs.ranges import Quality, require_ranges
 from robo_manip_baselines.runs.versions import software_versions
 
 SUMMARY = "summary.json"
-
-POLL = 0.2
-"""s between looks at the steps that worker processes have taken."""
 
 EXPERT_VERSION = 4
 """Schema version of the episodes of experts."""
@@ -363,38 +360,17 @@ def _record_all(
         return
     logger.info("starting %d worker processes", workers)
     counter, seen = multiprocessing.get_context("spawn").Value("q", 0), 0
-    waiting, is_done = deque(seeds), False
-    pool: list[Worker] = []
+
+    def report_steps() -> None:
+        nonlocal seen
+        taken = counter.value
+        on_steps(taken - seen)
+        seen = taken
+
     try:
-        for _ in range(workers):
-            pool.append(Worker(_Recorder, collection, counter))
-            pool[-1].submit(waiting.popleft())
-        busy = list(pool)
-        while busy:
-            ready = wait_for(busy, POLL)
-            taken = counter.value
-            on_steps(taken - seen)
-            seen = taken
-            for worker in ready:
-                yield _receive(worker)
-                if waiting:
-                    worker.submit(waiting.popleft())
-                else:
-                    busy.remove(worker)
-        is_done = True
+        yield from answers(_Recorder, (collection, counter), seeds, workers, report_steps)
     finally:
-        close_workers(pool, at_once=not is_done)
         remove_partial_episodes(collection.out)
-
-
-def _receive(worker: Worker) -> int:
-    try:
-        return worker.receive()
-    except WorkerDiedError as error:
-        raise RuntimeError(
-            f"a worker process died ({error}); if it was killed for lack of memory, take fewer "
-            "--workers; the same command records what is missing"
-        ) from error
 
 
 def _record(

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import multiprocessing
 import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from robo_manip_baselines.runs.errors import RequestError, WriteError
 from robo_manip_baselines.runs.interrupt import ENDING
+
+POLL = 0.2
+"""Most s between two calls of ``on_poll``, see `answers`."""
 
 _PATIENCE = 5.0
 """s for a worker to end by itself, when the run is over, before it is killed."""
@@ -99,6 +103,55 @@ def wait_for(workers: Sequence[Worker], timeout: float | None = None) -> list[Wo
     """Wait until some workers have answered, at most ``timeout`` s, and return them."""
     ready = wait([worker.pipe for worker in workers], timeout)
     return [worker for worker in workers if worker.pipe in ready]
+
+
+def answers(
+    make_handler: Callable[..., Handler],
+    args: Sequence[Any],
+    requests: Iterable[Any],
+    workers: int,
+    on_poll: Callable[[], None] | None = None,
+) -> Generator[Any]:
+    """Yield the answers to requests as they come, from processes that are started and ended here.
+
+    Closed before the last answer, or after an error, it ends the processes at once.
+
+    Args:
+        make_handler: see `Worker`.
+        args: sent to each process.
+        requests: each is taken when a process is free for it.
+        workers: most processes; never more than requests.
+        on_poll: called again and again, every `POLL` s at least, while answers are waited for.
+
+    Raises:
+        RequestError, WriteError, RuntimeError: see `Worker.receive`; also where a process died.
+    """
+    waiting, pool, is_done = iter(requests), list[Worker](), False
+    try:
+        for request in itertools.islice(waiting, workers):
+            pool.append(Worker(make_handler, *args))
+            pool[-1].submit(request)
+        busy = list(pool)
+        while busy:
+            ready = wait_for(busy, POLL if on_poll else None)
+            if on_poll:
+                on_poll()
+            for worker in ready:
+                try:
+                    answer = worker.receive()
+                except WorkerDiedError as error:
+                    raise RuntimeError(
+                        f"a worker process died ({error}); if it was killed for lack of memory, "
+                        "take fewer workers; the same command does what is missing"
+                    ) from error
+                busy.remove(worker)
+                for request in itertools.islice(waiting, 1):
+                    worker.submit(request)
+                    busy.append(worker)
+                yield answer
+        is_done = True
+    finally:
+        close_workers(pool, at_once=not is_done)
 
 
 def _work(pipe: Connection, make_handler: Callable[..., Handler], args: tuple[Any, ...]) -> None:

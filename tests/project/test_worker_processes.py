@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -13,7 +14,13 @@ from pathlib import Path
 import pytest
 
 from robo_manip_baselines.runs.errors import RequestError, WriteError
-from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
+from robo_manip_baselines.runs.processes import (
+    Worker,
+    WorkerDiedError,
+    answers,
+    close_workers,
+    wait_for,
+)
 
 
 def fail(kind: type[Exception]) -> None:
@@ -42,6 +49,32 @@ def test_answers_and_errors_come_back() -> None:
             workers[0].receive()
     finally:
         close_workers(workers)
+
+
+@pytest.mark.long
+def test_requests_are_answered_by_as_many_processes_as_they_need() -> None:
+    polls: list[None] = []
+    found = answers(
+        functools.partial, (math.sqrt,), [4.0, 9.0, 16.0], 2, lambda: polls.append(None)
+    )
+    assert sorted(found) == [2.0, 3.0, 4.0]
+    assert polls
+    assert list(answers(functools.partial, (math.sqrt,), [], 2)) == []
+    with pytest.raises(RequestError, match=r"^no camera$"):
+        list(answers(functools.partial, (fail,), [RequestError], 9))
+    with pytest.raises(
+        RuntimeError, match=r"died \(exit code 3\); if it was killed for lack of mem"
+    ):
+        list(answers(functools.partial, (os._exit,), [3], 1))
+
+
+@pytest.mark.long
+def test_requests_that_are_not_waited_for_are_not_taken() -> None:
+    waiting = iter(range(100))
+    found = answers(functools.partial, (math.sqrt,), waiting, 2)
+    next(found)
+    found.close()
+    assert next(waiting) <= 4
 
 
 PARENT = """

@@ -20,7 +20,7 @@ from robo_manip_baselines.benchmark.foresight.forecasters import residual_horizo
 from robo_manip_baselines.runs.documents import Schema, as_json, convert, read_json, read_json_lines
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import AppendFile, FolderKind, write_json, write_text
-from robo_manip_baselines.runs.processes import Worker, WorkerDiedError, close_workers, wait_for
+from robo_manip_baselines.runs.processes import answers
 from robo_manip_baselines.runs.versions import software_versions, source_digest
 
 SCHEMA = Schema("robo_manip_baselines/foresight", 1)
@@ -170,26 +170,4 @@ def _answers(
     if num_workers == 1:
         yield from map(EpisodePlayer(motion_library), todo)
         return
-    waiting = iter(todo)
-    workers = [Worker(EpisodePlayer, motion_library) for _ in range(min(num_workers, len(todo)))]
-    at_once = True
-    try:
-        busy = []
-        for worker, request in zip(workers, waiting, strict=False):
-            worker.submit(request)
-            busy.append(worker)
-        while busy:
-            for worker in wait_for(busy):
-                try:
-                    rows = worker.receive()
-                except WorkerDiedError as error:
-                    raise RuntimeError(f"a worker process died ({error})") from error
-                request = next(waiting, None)
-                if request is None:
-                    busy.remove(worker)
-                else:
-                    worker.submit(request)
-                yield rows
-        at_once = False
-    finally:
-        close_workers(workers, at_once=at_once)
+    yield from answers(EpisodePlayer, (motion_library,), todo, num_workers)
