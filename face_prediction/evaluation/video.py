@@ -29,8 +29,7 @@ from face_prediction.forecast.interface import mouth_centre
 from face_prediction.prediction.errors import mouth_distances
 from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.files import atomic_file
-from robo_manip_baselines.runs.videos import METADATA
+from robo_manip_baselines.runs.videos import h264_stream
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -72,16 +71,9 @@ def h264_file(
     import av  # not needed to make tables
 
     count = last_tick = begin = 0
-    with (
-        atomic_file(path) as temporary,
-        # the index goes to the front, so that a browser starts to play before all has arrived
-        av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container,
-    ):
-        container.metadata.update(METADATA)
-        stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
-        stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "20", "preset": preset}
-        stream.codec_context.thread_count = threads
+    about = Fraction(rate).limit_denominator(1001)
+    settings = {"crf": 20, "preset": preset, "threads": threads}
+    with h264_stream(path, about, **settings) as (container, stream):
         if is_timed:
             stream.codec_context.time_base = Fraction(1, _CLOCK)
 
@@ -103,7 +95,6 @@ def h264_file(
         yield append
         if not count:
             raise RequestError(f"{path}: there was no image to write")
-        container.mux(stream.encode(None))
 
 
 def draw_line(image: Image, start: Floats, end: Floats, colour: Colour, thickness: int) -> None:

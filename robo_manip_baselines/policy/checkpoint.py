@@ -94,7 +94,7 @@ class Checkpoint:
         config: the policy's own frozen dataclass.
         dims: dimensions of its inputs and outputs.
         spec: its observations in training.
-        env: name of the environment in ``ENVS``.
+        env: name of the task.
         execution: default execution of its action chunks.
         normalization: of states and actions, from the training episodes.
         action_names: (A,) elements of an action.

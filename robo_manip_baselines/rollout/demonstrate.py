@@ -249,11 +249,6 @@ class Collection:
         """Return the collection that ``to_json`` was called on."""
         return cls(**{**values, "out": Path(values["out"]), "seeds": range(*values["seeds"])})
 
-    def path(self, seed: int) -> Path | None:
-        """Return the file of a finished seed, wherever it is; None if there is none."""
-        paths = (episode_path(self.out, seed, success) for success in (True, False))
-        return next((path for path in paths if path.is_file()), None)
-
 
 @dataclass(frozen=True)
 class CollectionSummary:

@@ -27,10 +27,9 @@ from robo_manip_baselines.rollout.demonstrate import remake_env, replay
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.rollout.rollout import Recording
 from robo_manip_baselines.rollout.workers import EnvConfig
-from robo_manip_baselines.runs.files import atomic_file
 from robo_manip_baselines.runs.images import REDUCTIONS, decode_image
 from robo_manip_baselines.runs.progress import track
-from robo_manip_baselines.runs.videos import METADATA
+from robo_manip_baselines.runs.videos import h264_stream
 
 Colour = tuple[int, int, int]
 Item = TypeVar("Item")
@@ -107,22 +106,12 @@ class VideoWriter:
     def _open(self, path: Path, rate: Fraction, crf: int, preset: str) -> Iterator[None]:
         import av  # slow to import; only videos need it
 
-        # The index goes to the front so that a browser starts to play before all has arrived.
-        options = {"movflags": "+faststart"}
-        with (
-            atomic_file(path) as temporary,
-            av.open(str(temporary), "w", format="mp4", options=options) as self._container,
-        ):
+        settings = {"crf": crf, "preset": preset, "threads": 1}  # the same bytes on any machine
+        with h264_stream(path, rate, **settings) as (self._container, self._stream):
             self._frame_type = av.VideoFrame
-            self._container.metadata.update(METADATA)
-            self._stream = self._container.add_stream("libx264", rate=rate)
-            self._stream.pix_fmt = "yuv420p"
-            self._stream.options = {"crf": str(crf), "preset": preset}
-            self._stream.codec_context.thread_count = 1  # the same bytes on any number of cores
             yield
             if self._shape is None:
                 raise ValueError(f"no frame was written to '{path}'")
-            self._container.mux(self._stream.encode(None))
 
     def write(self, image: np.ndarray) -> None:
         """Append a frame.
@@ -166,12 +155,15 @@ def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(row, axis=1)
 
 
+LINE_WIDTH = 2
+"""Pixels, of a track and of the ring at its end."""
+
+
 def draw_track(
     image: np.ndarray,
     points: np.ndarray,
     colour: Colour = YELLOW,
     *,
-    thickness: int = 2,
     radius: int = 8,
 ) -> np.ndarray:
     """Draw where a point has been: a line that fades towards its past, a ring at its present.
@@ -181,7 +173,6 @@ def draw_track(
         points: (N, 2) pixels, x right and y down, oldest first; rows that are NaN (not in view)
             interrupt the line.
         colour: RGB.
-        thickness: of the line, in pixels.
         radius: of the ring, in pixels.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
@@ -196,14 +187,14 @@ def draw_track(
         if is_valid[index - 1] and is_valid[index]:
             value = round(255 * (0.15 + 0.85 * index / last))
             ends = places[index - 1], places[index]
-            cv2.line(opacity, *ends, value, thickness, cv2.LINE_AA, shift=4)
+            cv2.line(opacity, *ends, value, LINE_WIDTH, cv2.LINE_AA, shift=4)
     drawn = _paint(image, opacity, colour)
     if len(points) and valid[-1]:
         centre = fixed[-1].tolist()
         # The dark rim lies outside only: what is in the ring stays to be seen.
-        rim = radius * 16 + 8 * thickness + 8
+        rim = radius * 16 + 8 * LINE_WIDTH + 8
         cv2.circle(drawn, centre, rim, BLACK, 1, cv2.LINE_AA, shift=4)
-        cv2.circle(drawn, centre, radius * 16, colour, thickness, cv2.LINE_AA, shift=4)
+        cv2.circle(drawn, centre, radius * 16, colour, LINE_WIDTH, cv2.LINE_AA, shift=4)
     return drawn
 
 
@@ -261,25 +252,23 @@ def _write_frames(
             pass
 
 
-def preview_frames(path: Path, size: tuple[int, int] = PREVIEW_SIZE) -> Iterator[NDArray[np.uint8]]:
+def preview_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
     """Draw an episode; yield (H, W, 3) uint8 frames, the cameras side by side.
 
-    Args:
-        path: of the episode.
-        size: height and width of each camera's view, pixels; of recorded images the height.
+    Each view has `PREVIEW_SIZE`; of recorded images the height.
 
     The recorded images are shown where all cameras were recorded at the size of the views or
     larger. Otherwise the episode is replayed and rendered, without shadows, as images are recorded:
     those take five times as long.
     """
-    changes = {"cameras": (), "image_size": size, "render_size": None}
+    changes = {"cameras": (), "image_size": PREVIEW_SIZE, "render_size": None}
     with EpisodeReader(path) as episode, closing(remake_env(episode, **changes)) as env:
         world = world_of(env)
         env.reset(seed=int(episode.attributes["seed"]))
         recorded = episode.attributes["image_size"]
         is_recorded = set(CAMERAS) <= set(episode.attributes["cameras"])
-        is_recorded = is_recorded and recorded[0] >= size[0]
-        (height, width), reduction = size, 1
+        (height, width), reduction = PREVIEW_SIZE, 1
+        is_recorded = is_recorded and recorded[0] >= height
         if is_recorded:
             width = round(recorded[1] * height / recorded[0])
             reduction = max(r for r in REDUCTIONS if recorded[0] >= r * height)

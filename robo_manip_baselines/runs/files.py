@@ -307,20 +307,6 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, to_json(value))
 
 
-@contextmanager
-def text_path(path: Path) -> Iterator[str]:
-    """Yield a path to a file as UTF-8 text, for libraries that take no other bytes.
-
-    Raises:
-        OSError: the file cannot be opened.
-    """
-    if _SURROGATE.search(str(path)) is None:
-        yield str(path)
-    else:
-        with path.open("rb") as file:
-            yield f"/dev/fd/{file.fileno()}"
-
-
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file, 64 hexadecimal digits."""
     digest = hashlib.sha256()

@@ -306,7 +306,7 @@ class Trainer:
             losses = self.held_out(self.state.evaluated)
             self._write("validation", losses)
             if self._early and self._early.add(self._progress.step, losses["loss"]):
-                self._write_checkpoint(self._setup.config.folder / BEST, kept=1)
+                self._write_checkpoint(self._setup.config.folder / BEST)
         if self._early and self._processes.any(self._early.is_over, self._device):
             self.ended_early = True
             if self._processes.is_main:
@@ -340,16 +340,19 @@ class Trainer:
             flags.append(self.state.losses.sums.isfinite().all())
         self._require_finite(bool(torch.stack(flags).all()))
         if self._processes.is_main:
-            self._write_checkpoint(self._setup.config.folder, KEPT_CHECKPOINTS)
+            run = self._setup.config.folder
+            self._write_checkpoint(run)
             self._saved_step = self._progress.step
+            prune_checkpoints(run, KEPT_CHECKPOINTS)
+            # Not before: a run that is killed goes on from here, and has the best one until here.
+            prune_checkpoints(run / BEST, 1)
 
-    def _write_checkpoint(self, run: Path, kept: int) -> None:
-        """Write a checkpoint into a run folder, and remove all but the newest."""
+    def _write_checkpoint(self, run: Path) -> None:
+        """Write a checkpoint into a run folder."""
         step, weights = self._progress.step, self.state.evaluated.state_dict()
         tensors, json = self.state.state_dict(step, self._progress.seconds)
         checkpoint = self._setup.checkpoint(step)
         write_checkpoint(step_folder(run, step), checkpoint, weights, tensors, json)
-        prune_checkpoints(run, kept)
 
     def _require_finite(self, is_finite: bool) -> None:
         if self._processes.any(not is_finite, self._device):

@@ -444,6 +444,31 @@ def test_a_loss_that_falls_is_followed(episodes: Path, tmp_path: Path) -> None:
     assert held_out(model)["loss"] == pytest.approx(best["loss"], rel=1e-6)  # float32
 
 
+def test_a_killed_run_has_the_best_checkpoint_of_what_it_goes_on_from(
+    episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = f"{PLAIN} --schedule constant --learning_rate 0.01 --validate_every 1 --early_stopping 9"
+    line += " --checkpoint_every 4"
+
+    def die(trainer: Trainer) -> None:
+        if trainer._progress.step == 8:
+            raise KeyboardInterrupt
+        save(trainer)
+
+    save = Trainer._save
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_save", die)
+        with pytest.raises(KeyboardInterrupt):
+            run(line, episodes, tmp_path / "killed")
+    assert list_checkpoints(tmp_path / "killed")[-1][0] == 4
+    steps = [step for step, _ in list_checkpoints(tmp_path / "killed" / BEST)]
+    assert steps[0] <= 4 < steps[-1]
+    for name in ("killed", "whole"):
+        run(line, episodes, tmp_path / name)
+    assert len(list_checkpoints(tmp_path / "killed" / BEST)) == 1
+    assert contents(tmp_path / "killed" / BEST) == contents(tmp_path / "whole" / BEST)
+
+
 def test_early_stopping_needs_episodes_to_stop_by(episodes: Path, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="no episodes are held out to stop by"):
         configure(f"{MLP} --validation_fraction 0 --early_stopping 3", episodes, tmp_path)

@@ -103,7 +103,7 @@ def read_video(path: Path, row: ResultRow) -> EpisodeVideo:
             bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
             jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, POSTER_QUALITY])[1]
             return EpisodeVideo(row, small.read_bytes(), jpeg.tobytes())
-    except (OSError, ValueError) as error:  # PyAV's errors are of these kinds
+    except (av.error.FFmpegError, OSError, ValueError) as error:
         raise RequestError(
             f"video '{path}' cannot be read ({error}); evaluate with --video, or leave it out"
         ) from error

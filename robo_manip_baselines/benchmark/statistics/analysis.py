@@ -187,7 +187,6 @@ def analyze(
     reference: str | None = None,
     conditions: Mapping[str, ConditionDescription] | None = None,
     headline: str = "success",
-    seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> BenchmarkStatistics:
     """Compute all statistics.
@@ -203,7 +202,6 @@ def analyze(
         conditions: name -> description of conditions whose rows do not describe them; may hold
             others, too.
         headline: end point of tables and figures, ``success`` or ``success_strict``.
-        seed: of the resampling.
         resamples: of each bootstrap.
 
     Raises:
@@ -235,7 +233,7 @@ def analyze(
     limit = task.success_time_limit
 
     def rng(name: str, measure: str) -> np.random.Generator:
-        return _generator(seed, f"{name}/{measure}")
+        return _generator(f"{name}/{measure}")
 
     def statistics_of(condition: ConditionDescription) -> ConditionStatistics:
         name = condition.name
@@ -285,15 +283,15 @@ def analyze(
         corrected = holm([getattr(c, kind) for c in found])
         found = [replace(c, **{kind: new}) for c, new in zip(found, corrected, strict=True)]
     claims = [claim for claim in study.claims if set(claim.weights) <= set(outcomes)]
-    findings = tuple(_finding(claim, study, outcomes, seed, resamples) for claim in claims)
+    findings = tuple(_finding(claim, study, outcomes, resamples) for claim in claims)
     seeds = set.intersection(*(own.complete_seeds for own in outcomes.values()))
     return BenchmarkStatistics(
         task, study, tuple(found), reference, tuple(sorted(seeds)), findings, headline
     )
 
 
-def _generator(seed: int, text: str) -> np.random.Generator:
-    return np.random.default_rng([seed, zlib.crc32(text.encode())])
+def _generator(text: str) -> np.random.Generator:
+    return np.random.default_rng([0, zlib.crc32(text.encode())])
 
 
 def _described_by(name: str, rows: Sequence[ResultRow]) -> ConditionDescription:
@@ -305,14 +303,13 @@ def _finding(
     claim: Claim,
     study: TaskStudy,
     outcomes: Mapping[str, OutcomeMatrix],
-    seed: int,
     resamples: int,
 ) -> Finding:
     """Take the contrast of a claim over the seeds that all of its conditions have.
 
     Times are compared over episodes in which all of them succeeded.
     """
-    rng = _generator(seed, claim.text)
+    rng = _generator(claim.text)
     matrices = on_common_seeds([outcomes[name] for name in claim.weights], claim.measure)
     contrast = np.tensordot(list(claim.weights.values()), matrices, axes=1)
     estimate = mean_estimate(contrast, rng, resamples)
