@@ -28,6 +28,7 @@ from face_prediction.models.loading import SHIPPED
 from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoReader, require_video
+from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import locked_file, require_out_file
 from robo_manip_baselines.runs.ranges import Positive, require_ranges
@@ -102,7 +103,7 @@ def run_live(options: LiveOptions) -> int:
         except KeyboardInterrupt:
             if not statistics.frames:
                 raise
-            code = 130
+            code = EXIT_INTERRUPTED
     if options.out is not None:
         logger.info("%s: %d frames", options.out, statistics.frames)
     counts = (statistics.faces, statistics.frames, statistics.crops)

@@ -45,6 +45,7 @@ from face_prediction.models.settings import (
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import SequenceWindows, WindowBatch, augment, window_batches
+from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.documents import Schema, convert
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
@@ -142,9 +143,10 @@ def train_predictor(options: FaceTrainOptions) -> int:
         )
         trainer.train(stop)
     write_curves(folder / "curves.png", read_metrics(folder / METRICS_FILE), folder.name, CURVES)
-    end = "stopped; the same command carries on" if stop.is_made else "done"
+    is_done = trainer.progress.step == settings.steps
+    end = "done" if is_done else "stopped; the same command carries on"
     logger.info("%s: %s", folder, end)
-    return 130 if stop.is_made else 0
+    return 0 if is_done else EXIT_INTERRUPTED
 
 
 @dataclass(frozen=True)
