@@ -131,8 +131,7 @@ def train_predictor(options: FaceTrainOptions) -> int:
             memory *= 1 - _VALIDATION_SHARE
         windows = SequenceWindows(dataset, people.train, model, memory)
         if found is None:
-            generator = torch.Generator().manual_seed(torch_seed(options.seed, "prepare"))
-            model.prepare(windows.sequences, generator)
+            model.prepare(windows.sequences)
         trainer = PredictorTrainer(options, settings, record, model.to(device), windows, validation)
         if found is not None:
             trainer.restore(*found)
