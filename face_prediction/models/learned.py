@@ -89,20 +89,6 @@ class LearnedPredictor:
         load_tensors(model, tensors, folder / MODEL_FILE)
         return cls(model.to(device), record, batch_size)
 
-    @property
-    def test_fold(self) -> int:
-        """Fold of people that the network may be evaluated on.
-
-        Raises:
-            RequestError: there is none: it was trained on everybody.
-        """
-        if not self.record.folds["test"]:
-            raise RequestError(
-                f"this {self.name} was trained on the people of all folds and can be judged on "
-                "none of them; train one with --test_fold"
-            )
-        return self.record.folds["test"][0]
-
     def predict(
         self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
