@@ -21,6 +21,7 @@ from face_prediction.evaluation.error_stats import compact_json
 from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
+from face_prediction.markdown import markdown_table
 from robo_manip_baselines.runs.documents import read_json
 from robo_manip_baselines.runs.files import FolderKind, write_text
 
@@ -160,7 +161,7 @@ def markdown_table_1(summary: KindSummary) -> str:
         printed = [_NOTHING if value is None else f"{value:.3f}" for value in values]
         cells = [f"paper, {name} (other data)", *printed[:-1], f"{printed[-1]} at 256 px"]
         rows.append(cells + [""] * (len(head) - len(cells)))
-    return _table(head, rows)
+    return "\n".join(markdown_table(head, rows))
 
 
 def results_json(report: EvaluationReport) -> str:
@@ -182,7 +183,8 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
     by_frame = ["", *frames, "all"]
 
     def table(head: Sequence[str], chosen: Iterable[int], *columns: Column) -> str:
-        return _table(head, ([rows[i].name, *_cells(summary, i, columns)] for i in chosen))
+        cells = ([rows[i].name, *_cells(summary, i, columns)] for i in chosen)
+        return "\n".join(markdown_table(head, cells))
 
     forecasts = [i for i, row in rows.items() if row.role != "reference"]
     count = f"{summary.sequences} sequences of {summary.subjects} {people}"
@@ -214,7 +216,7 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
         cells = [line for line in cells if set(line[1:]) != {_NOTHING}]
         if len(frames) == len(PAPER_TABLE_2[heading]):
             cells.append(["paper, approach 3 (other data)", *map(_ssim, PAPER_TABLE_2[heading])])
-        parts.append(_table([heading, *frames], cells))
+        parts.append("\n".join(markdown_table([heading, *frames], cells)))
     cells = []
     for i, row in rows.items():
         for level in TABULATED_LEVELS if row.has_intervals else ():
@@ -223,7 +225,7 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
             cells.append([f"{row.name}, {level:.0%}", *_cells(summary, i, columns)])
     if cells:
         parts.append("### Coverage of the mouth centre's intervals, U and V together, in percent")
-        parts.append(_table(by_frame, cells))
+        parts.append("\n".join(markdown_table(by_frame, cells)))
     shuffled = [i for i in rows if not np.isnan(summary.numbers["exchanged"].value[i]).all()]
     if shuffled:
         parts.append("### Mean distance with another sequence's images against with its own")
@@ -252,11 +254,6 @@ def _bounded(summary: KindSummary, key: str, place: tuple[Any, ...]) -> np.ndarr
 
 def _share(value: float) -> str:
     return f"{100 * value:.1f}"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
-    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
 def _table_1_csv(report: EvaluationReport) -> str:

@@ -29,7 +29,7 @@ from face_prediction.evaluation.predictors import EvaluatedPredictor
 from face_prediction.evaluation.scoring import interval_levels
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.forecast.interface import mouth_centre
-from face_prediction.motion.report import markdown_table
+from face_prediction.markdown import markdown_table
 from face_prediction.prediction.interface import Predictor, StatefulPredictor, TrackForecast
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import write_text
