@@ -22,7 +22,7 @@ from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
 from face_prediction.markdown import markdown_table
-from robo_manip_baselines.runs.documents import read_json
+from robo_manip_baselines.runs.documents import convert, read_json
 from robo_manip_baselines.runs.files import FolderKind, write_text
 
 Format = Callable[[float], str]
@@ -95,16 +95,57 @@ class EvaluationReport:
     provenance: dict[str, Any]
 
 
-def write_evaluation_report(folder: Path, report: EvaluationReport) -> None:
-    """Write the four files, each whole or not at all.
+def write_evaluation_report(
+    folder: Path, report: EvaluationReport, earlier: Sequence[str] = ()
+) -> list[Path]:
+    """Write ``results.json`` and the tables, each whole or not at all.
+
+    Args:
+        folder: to write to.
+        report: on what was evaluated.
+        earlier: files of an earlier evaluation, which stay listed until they are removed.
+
+    Returns:
+        The files beside ``results.json``.
 
     Raises:
         RequestError: the folder cannot be written to.
     """
-    write_text(folder / RESULTS, results_json(report))  # first: by it the folder is known as ours
-    write_text(folder / "tables.md", markdown_text(report))
-    write_text(folder / "table1.csv", _table_1_csv(report))
-    write_text(folder / "table2.csv", _table_2_csv(report))
+    # first: by it the folder is known as ours
+    write_text(folder / RESULTS, results_json(report, earlier))
+    texts = {
+        "tables.md": markdown_text(report),
+        "table1.csv": _table_1_csv(report),
+        "table2.csv": _table_2_csv(report),
+    }
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
+
+
+def earlier_files(folder: Path) -> list[str]:
+    """Names of the files that an evaluation in ``folder`` has written beside ``results.json``.
+
+    None are known of evaluations of earlier releases, which had no such list.
+
+    Raises:
+        RequestError: the list is damaged.
+    """
+    path = folder / RESULTS
+    files = read_json(path).get("files", []) if path.exists() else []
+    return convert(files, list[str], f"'{path}': files")
+
+
+def list_files(
+    folder: Path, report: EvaluationReport, written: Iterable[Path], earlier: Iterable[str]
+) -> None:
+    """Remove the files of an ``earlier`` evaluation that were not ``written`` again; list these."""
+    names = {path.name for path in written}
+    for name in earlier:
+        path = folder / name
+        if name not in names and path.parent == folder and path.is_file():
+            path.unlink()
+    write_text(folder / RESULTS, results_json(report, sorted(names)))
 
 
 def _is_evaluation(folder: Path) -> bool:
@@ -164,10 +205,10 @@ def markdown_table_1(summary: KindSummary) -> str:
     return "\n".join(markdown_table(head, rows))
 
 
-def results_json(report: EvaluationReport) -> str:
-    """``results.json``: every number, and the provenance."""
+def results_json(report: EvaluationReport, files: Sequence[str] = ()) -> str:
+    """``results.json``: every number, the provenance, and the names of the ``files`` beside it."""
     record = {"schema": SCHEMA, "version": VERSION, **report.provenance}
-    record |= {"history": report.history, "folds": report.folds}
+    record |= {"files": files, "history": report.history, "folds": report.folds}
     record |= {"coverage_levels": LEVELS, "horizon_groups": GROUPS}
     kinds = {summary.kind: _kind_record(summary) for summary in report.kinds}
     return compact_json(record | {"kinds": kinds})

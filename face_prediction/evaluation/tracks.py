@@ -413,7 +413,12 @@ def _rounded(values: Floats) -> list[float | None]:
 
 def write_tracks(
     folder: Path, all_scores: Sequence[TrackScores], resamples: int, seed: int, warm_up: int
-) -> None:
-    """Write ``tracks.md`` and ``people.csv``, each whole or not at all."""
-    write_text(folder / "tracks.md", tracks_markdown(all_scores, resamples, seed, warm_up))
-    write_text(folder / "people.csv", people_csv(all_scores))
+) -> list[Path]:
+    """Write ``tracks.md`` and ``people.csv``, each whole or not at all; return their paths."""
+    texts = {
+        "tracks.md": tracks_markdown(all_scores, resamples, seed, warm_up),
+        "people.csv": people_csv(all_scores),
+    }
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
