@@ -73,6 +73,8 @@ there by averaging areas; persistence copies the last image. Rows of the paper a
 figures, from its own recordings."""
 
 RESULTS = "results.json"
+WRITTEN_NAMES = {"shuffled_images": "exchanged"}
+"""Keys of `KindSummary.numbers` that ``results.json`` has under the names of earlier releases."""
 
 _NOTHING = "–"
 _DIGITS = 9  # significant digits in CSV and JSON: more than the bootstrap is good for
@@ -267,10 +269,11 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
     if cells:
         parts.append("### Coverage of the mouth centre's intervals, U and V together, in percent")
         parts.append("\n".join(markdown_table(by_frame, cells)))
-    shuffled = [i for i in rows if not np.isnan(summary.numbers["exchanged"].value[i]).all()]
+    change: Column = ("shuffled_images", (), _percent, " to ")
+    shuffled = [i for i in rows if not np.isnan(summary.numbers[change[0]].value[i]).all()]
     if shuffled:
         parts.append("### Mean distance with another sequence's images against with its own")
-        parts.append(table(["", *groups, "all"], shuffled, ("exchanged", (), _percent, " to ")))
+        parts.append(table(["", *groups, "all"], shuffled, change))
     return parts
 
 
@@ -357,7 +360,9 @@ def _kind_record(summary: KindSummary) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for i, row in enumerate(summary.rows):
         numbers = {
-            key: {part: _rounded(values[i].tolist()) for part, values in vars(number).items()}
+            WRITTEN_NAMES.get(key, key): {
+                part: _rounded(values[i].tolist()) for part, values in vars(number).items()
+            }
             for key, number in summary.numbers.items()
             if not np.isnan(number.value[i]).all()
         }
