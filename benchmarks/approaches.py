@@ -29,8 +29,8 @@ from face_prediction.commands.train import run_train
 from face_prediction.dataset.sequences import KINDS
 from face_prediction.dataset.split import SplitName
 from face_prediction.evaluation.tables import PAPER_TABLE_1, PAPER_TABLE_2, RESULTS
+from face_prediction.markdown import markdown_table
 from face_prediction.models.settings import Decay
-from face_prediction.motion.report import markdown_table
 from face_prediction.training.options import FaceTrainOptions
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.documents import read_json

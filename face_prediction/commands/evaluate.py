@@ -41,6 +41,8 @@ from face_prediction.evaluation.statistics import summarise_kind
 from face_prediction.evaluation.tables import (
     EVALUATION,
     EvaluationReport,
+    earlier_files,
+    list_files,
     markdown_table_1,
     write_evaluation_report,
 )
@@ -128,6 +130,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
 
 
 def _evaluate(options: EvaluateOptions) -> int:
+    earlier = earlier_files(options.out)
     with ExitStack() as stack:
         dataset = stack.enter_context(FaceDataset(options.dataset))
         stack.enter_context(logging_redirect_tqdm())
@@ -194,19 +197,19 @@ def _evaluate(options: EvaluateOptions) -> int:
             rows = [*baselines, *networks]
             tracks = score_tracks(dataset.manifest, stretches, rows, warm_up, options.progress)
             record["tracks"] = tracks_record(tracks, options.resamples, options.seed, warm_up)
-        write_evaluation_report(
-            options.out, EvaluationReport(summaries, settings.history, folds, record)
-        )
+        report = EvaluationReport(summaries, settings.history, folds, record)
+        written = write_evaluation_report(options.out, report, earlier)
         logger.info("%s: tables.md, table1.csv, table2.csv, results.json", options.out)
         if tracks:
-            write_tracks(options.out, tracks, options.resamples, options.seed, warm_up)
+            written += write_tracks(options.out, tracks, options.resamples, options.seed, warm_up)
             logger.info("%s: tracks.md, people.csv", options.out)
         if options.figures:
-            if tracks and networks:
-                draw_gains(options.out / "gains.png", tracks)
-            write_figures(options.out, setup, scores, summaries)
-            write_forecast_video(options.out / "forecast.mp4", dataset, scores, summaries[0])
+            written += draw_gains(options.out / "gains.png", tracks)
+            written += write_figures(options.out, setup, scores, summaries)
+            written.append(options.out / "forecast.mp4")
+            write_forecast_video(written[-1], dataset, scores, summaries[0])
             logger.info("%s: figures and a video, which show people's faces", options.out)
+        list_files(options.out, report, written, earlier)
     for summary in summaries:
         print(f"\n{summary.kind}, {summary.sequences} sequences")  # noqa: T201
         print(markdown_table_1(summary))  # noqa: T201

@@ -13,7 +13,7 @@ from annotated_types import Interval
 
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings
-from face_prediction.evaluation.predictors import UNFITTED, BaselinePredictor
+from face_prediction.evaluation.predictors import UNFITTED, BaselinePredictor, dataset_landmarks
 from face_prediction.forecast import FORECASTERS, LandmarkSequences, fit_forecaster
 from face_prediction.live.loop import LiveStatistics, run_loop, video_sink, window_sink
 from face_prediction.live.sources import face_finder, live_frames
@@ -28,6 +28,7 @@ from face_prediction.models.loading import SHIPPED
 from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from face_prediction.tracking.video import VideoReader, require_video
+from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import locked_file, require_out_file
 from robo_manip_baselines.runs.ranges import Positive, require_ranges
@@ -102,7 +103,7 @@ def run_live(options: LiveOptions) -> int:
         except KeyboardInterrupt:
             if not statistics.frames:
                 raise
-            code = 130
+            code = EXIT_INTERRUPTED
     if options.out is not None:
         logger.info("%s: %d frames", options.out, statistics.frames)
     counts = (statistics.faces, statistics.frames, statistics.crops)
@@ -146,9 +147,7 @@ def load_forecaster(
                 raise RequestError(f"--checkpoint {checkpoint}: {missing}")
             with FaceDataset(dataset) as opened:
                 settings = opened.manifest.settings
-                every = opened.indices().tolist()
-                landmarks = np.stack([opened.landmarks(i)[..., :2] for i in every])
-                known = LandmarkSequences(landmarks, tuple(opened.entry(i).subject for i in every))
+                known = dataset_landmarks(opened, opened.indices())
         predictor = BaselinePredictor(fit_forecaster(checkpoint, known))
         return checkpoint, LandmarkForecaster(predictor, HORIZON), settings
     import torch  # only where it is needed

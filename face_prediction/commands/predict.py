@@ -31,6 +31,7 @@ from face_prediction.dataset.sequences import ClipFrames, SequenceSettings, clip
 from face_prediction.dataset.tracks import pixel_landmarks
 from face_prediction.evaluation.predictors import batch_size, cross_fit, require_strangers
 from face_prediction.forecast.interface import mouth_centre
+from face_prediction.markdown import markdown_table
 from face_prediction.motion.library import (
     MOTION_LIBRARY,
     LiftedClip,
@@ -41,7 +42,6 @@ from face_prediction.motion.library import (
     save_motion,
 )
 from face_prediction.motion.motion import MotionSettings
-from face_prediction.motion.report import markdown_table
 from face_prediction.prediction.interface import Predictor, StatefulPredictor
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError

@@ -31,8 +31,8 @@ from face_prediction.dataset.sequences import (
     kind_of,
     sequence_statistics,
 )
+from face_prediction.markdown import markdown_table
 from face_prediction.motion.attribution import Attribution
-from face_prediction.motion.report import markdown_table
 from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError

@@ -58,15 +58,17 @@ def new_matplotlib_figure(width: float, height: float, layout: str | None = "con
 
 def write_figures(
     folder: Path, setup: EvaluationSetup, scores: EvaluationScores, summaries: Sequence[KindSummary]
-) -> None:
-    """Write all figures.
+) -> list[Path]:
+    """Write all figures, and return their paths.
 
     Raises:
         RequestError: matplotlib is not installed, or the folder cannot be written to.
     """
-    draw_errors(folder / "errors.png", summaries)
+    written = [folder / "errors.png"]
+    draw_errors(written[0], summaries)
     if with_intervals := [s for s in summaries if any(row.has_intervals for row in s.rows)]:
-        draw_calibration(folder / "calibration.png", with_intervals)
+        written.append(folder / "calibration.png")
+        draw_calibration(written[-1], with_intervals)
     for summary in summaries:
         place = _lively_sequence(scores, summary.kind)
         index, row = int(setup.selection.indices[place]), setup.selection.rows[place]
@@ -80,6 +82,8 @@ def write_figures(
             title = f"{predictor.name}, {summary.kind}: clip {row.clip}"
             first = setup.dataset.manifest.settings.history + 1
             draw_forecast(path, title, first, truth, predictor.forecast([row], batch))
+            written.append(path)
+    return written
 
 
 def draw_errors(path: Path, summaries: Sequence[KindSummary]) -> None:
@@ -112,16 +116,19 @@ MOST_NAMES = 12
 """People whose names are written beside their dots; more would overlap."""
 
 
-def draw_gains(path: Path, all_scores: Sequence[TrackScores]) -> None:
+def draw_gains(path: Path, all_scores: Sequence[TrackScores]) -> list[Path]:
     """Error of the first network against the best baseline's, by the smoothness of the motion.
 
     A dot is a person, the larger the more frames there are of them; frames 3-5 of whole tracks. Up
     to `MOST_NAMES` people are named. Without a network that forecasts whole tracks there is no
     figure.
+
+    Returns:
+        The path, if it was drawn.
     """
     networks = [[i for i, (_, role) in enumerate(s.rows) if role == "network"] for s in all_scores]
     if not any(networks):
-        return
+        return []
     figure = new_matplotlib_figure(6.4, 4.8)
     axes = figure.subplots()
     names: set[str] = set()
@@ -150,6 +157,7 @@ def draw_gains(path: Path, all_scores: Sequence[TrackScores]) -> None:
     axes.set_ylabel("error against the best baseline, %\n(below 0: better)")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16))
     _save_png(figure, path)
+    return [path]
 
 
 def draw_forecast(

@@ -126,8 +126,8 @@ class KindSummary:
             ``ssim_gain`` over persistence, ``ssim_own_size``, ``ssim_copy_own_size``, ``skill``
             against persistence; (R, H, K): ``coverage``; each of these over all frames, without
             the axis H, with ``pooled_`` before its name. ``difference`` (R, G) in percent of the
-            best baseline, and ``exchanged`` (R, G + 1), with the images of other sequences, in
-            percent of the row itself, by group and over all frames. NaN where there is none.
+            best baseline, and ``shuffled_images`` (R, G + 1), with the images of other sequences,
+            in percent of the row itself, by group and over all frames. NaN where there is none.
     """
 
     kind: str
@@ -221,7 +221,7 @@ def _columns(
         "ssim_own_size": stack("own_similarity"),
         "ssim_copy_own_size": np.stack(copies, axis=1),
         "coverage": coverage(stack("levels")),
-        "exchanged": mouth_distances(stack("shuffled_residuals")),
+        "shuffled_distance": mouth_distances(stack("shuffled_residuals")),
     }
 
 
@@ -246,7 +246,7 @@ def _numbers(
     groups = [slice(first - 1, last) for first, last in GROUPS]
     for name, ours, theirs, spans in (
         ("difference", distance, baseline, groups),
-        ("exchanged", data["exchanged"], distance, [*groups, slice(None)]),
+        ("shuffled_images", data["shuffled_distance"], distance, [*groups, slice(None)]),
     ):
         ratios = [_ratio(ours[..., span], theirs[..., span], weight, 2) for span in spans]
         result[name] = 100 * (np.stack(ratios, axis=-1) - 1)

@@ -21,7 +21,8 @@ from face_prediction.evaluation.error_stats import compact_json
 from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
-from robo_manip_baselines.runs.documents import read_json
+from face_prediction.markdown import markdown_table
+from robo_manip_baselines.runs.documents import convert, read_json
 from robo_manip_baselines.runs.files import FolderKind, write_text
 
 Format = Callable[[float], str]
@@ -72,6 +73,8 @@ there by averaging areas; persistence copies the last image. Rows of the paper a
 figures, from its own recordings."""
 
 RESULTS = "results.json"
+WRITTEN_NAMES = {"shuffled_images": "exchanged"}
+"""Keys of `KindSummary.numbers` that ``results.json`` has under the names of earlier releases."""
 
 _NOTHING = "–"
 _DIGITS = 9  # significant digits in CSV and JSON: more than the bootstrap is good for
@@ -94,16 +97,57 @@ class EvaluationReport:
     provenance: dict[str, Any]
 
 
-def write_evaluation_report(folder: Path, report: EvaluationReport) -> None:
-    """Write the four files, each whole or not at all.
+def write_evaluation_report(
+    folder: Path, report: EvaluationReport, earlier: Sequence[str] = ()
+) -> list[Path]:
+    """Write ``results.json`` and the tables, each whole or not at all.
+
+    Args:
+        folder: to write to.
+        report: on what was evaluated.
+        earlier: files of an earlier evaluation, which stay listed until they are removed.
+
+    Returns:
+        The files beside ``results.json``.
 
     Raises:
         RequestError: the folder cannot be written to.
     """
-    write_text(folder / RESULTS, results_json(report))  # first: by it the folder is known as ours
-    write_text(folder / "tables.md", markdown_text(report))
-    write_text(folder / "table1.csv", _table_1_csv(report))
-    write_text(folder / "table2.csv", _table_2_csv(report))
+    # first: by it the folder is known as ours
+    write_text(folder / RESULTS, results_json(report, earlier))
+    texts = {
+        "tables.md": markdown_text(report),
+        "table1.csv": _table_1_csv(report),
+        "table2.csv": _table_2_csv(report),
+    }
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
+
+
+def earlier_files(folder: Path) -> list[str]:
+    """Names of the files that an evaluation in ``folder`` has written beside ``results.json``.
+
+    None are known of evaluations of earlier releases, which had no such list.
+
+    Raises:
+        RequestError: the list is damaged.
+    """
+    path = folder / RESULTS
+    files = read_json(path).get("files", []) if path.exists() else []
+    return convert(files, list[str], f"'{path}': files")
+
+
+def list_files(
+    folder: Path, report: EvaluationReport, written: Iterable[Path], earlier: Iterable[str]
+) -> None:
+    """Remove the files of an ``earlier`` evaluation that were not ``written`` again; list these."""
+    names = {path.name for path in written}
+    for name in earlier:
+        path = folder / name
+        if name not in names and path.parent == folder and path.is_file():
+            path.unlink()
+    write_text(folder / RESULTS, results_json(report, sorted(names)))
 
 
 def _is_evaluation(folder: Path) -> bool:
@@ -160,13 +204,13 @@ def markdown_table_1(summary: KindSummary) -> str:
         printed = [_NOTHING if value is None else f"{value:.3f}" for value in values]
         cells = [f"paper, {name} (other data)", *printed[:-1], f"{printed[-1]} at 256 px"]
         rows.append(cells + [""] * (len(head) - len(cells)))
-    return _table(head, rows)
+    return "\n".join(markdown_table(head, rows))
 
 
-def results_json(report: EvaluationReport) -> str:
-    """``results.json``: every number, and the provenance."""
+def results_json(report: EvaluationReport, files: Sequence[str] = ()) -> str:
+    """``results.json``: every number, the provenance, and the names of the ``files`` beside it."""
     record = {"schema": SCHEMA, "version": VERSION, **report.provenance}
-    record |= {"history": report.history, "folds": report.folds}
+    record |= {"files": files, "history": report.history, "folds": report.folds}
     record |= {"coverage_levels": LEVELS, "horizon_groups": GROUPS}
     kinds = {summary.kind: _kind_record(summary) for summary in report.kinds}
     return compact_json(record | {"kinds": kinds})
@@ -182,7 +226,8 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
     by_frame = ["", *frames, "all"]
 
     def table(head: Sequence[str], chosen: Iterable[int], *columns: Column) -> str:
-        return _table(head, ([rows[i].name, *_cells(summary, i, columns)] for i in chosen))
+        cells = ([rows[i].name, *_cells(summary, i, columns)] for i in chosen)
+        return "\n".join(markdown_table(head, cells))
 
     forecasts = [i for i, row in rows.items() if row.role != "reference"]
     count = f"{summary.sequences} sequences of {summary.subjects} {people}"
@@ -214,7 +259,7 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
         cells = [line for line in cells if set(line[1:]) != {_NOTHING}]
         if len(frames) == len(PAPER_TABLE_2[heading]):
             cells.append(["paper, approach 3 (other data)", *map(_ssim, PAPER_TABLE_2[heading])])
-        parts.append(_table([heading, *frames], cells))
+        parts.append("\n".join(markdown_table([heading, *frames], cells)))
     cells = []
     for i, row in rows.items():
         for level in TABULATED_LEVELS if row.has_intervals else ():
@@ -223,11 +268,12 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
             cells.append([f"{row.name}, {level:.0%}", *_cells(summary, i, columns)])
     if cells:
         parts.append("### Coverage of the mouth centre's intervals, U and V together, in percent")
-        parts.append(_table(by_frame, cells))
-    shuffled = [i for i in rows if not np.isnan(summary.numbers["exchanged"].value[i]).all()]
+        parts.append("\n".join(markdown_table(by_frame, cells)))
+    change: Column = ("shuffled_images", (), _percent, " to ")
+    shuffled = [i for i in rows if not np.isnan(summary.numbers[change[0]].value[i]).all()]
     if shuffled:
         parts.append("### Mean distance with another sequence's images against with its own")
-        parts.append(table(["", *groups, "all"], shuffled, ("exchanged", (), _percent, " to ")))
+        parts.append(table(["", *groups, "all"], shuffled, change))
     return parts
 
 
@@ -252,11 +298,6 @@ def _bounded(summary: KindSummary, key: str, place: tuple[Any, ...]) -> np.ndarr
 
 def _share(value: float) -> str:
     return f"{100 * value:.1f}"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
-    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
 def _table_1_csv(report: EvaluationReport) -> str:
@@ -319,7 +360,9 @@ def _kind_record(summary: KindSummary) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for i, row in enumerate(summary.rows):
         numbers = {
-            key: {part: _rounded(values[i].tolist()) for part, values in vars(number).items()}
+            WRITTEN_NAMES.get(key, key): {
+                part: _rounded(values[i].tolist()) for part, values in vars(number).items()
+            }
             for key, number in summary.numbers.items()
             if not np.isnan(number.value[i]).all()
         }

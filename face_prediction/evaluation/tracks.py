@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 from face_prediction.dataset.manifest import Manifest
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.dataset.tracks import FaceStretch
+from face_prediction.evaluation import statistics
 from face_prediction.evaluation.predictors import EvaluatedPredictor
 from face_prediction.evaluation.scoring import interval_levels
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.forecast.interface import mouth_centre
-from face_prediction.motion.report import markdown_table
+from face_prediction.markdown import markdown_table
 from face_prediction.prediction.interface import Predictor, StatefulPredictor, TrackForecast
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import write_text
@@ -39,13 +40,13 @@ Floats = NDArray[np.float64]
 
 HORIZON = 24
 """Frames ahead, 0.8 s: as far as the robot's side looks."""
-GROUPS: dict[str, tuple[int, int]] = {
-    "1–2": (1, 2),
-    "3–5": (3, 5),
+TRACK_GROUPS: dict[str, tuple[int, int]] = {
+    **{f"{first}–{last}": (first, last) for first, last in statistics.GROUPS},
     **{str(h): (h, h) for h in (8, 12, 18, 24)},
 }
-"""Frames ahead (from, to) that errors are the mean of."""
-FAR = list(GROUPS).index("3–5")
+"""Frames ahead (from, to) that errors are the mean of: those of sequences, and farther ones."""
+GROUPS = TRACK_GROUPS  # the name that benchmarks/forecast_ablation.py imports
+FAR = list(TRACK_GROUPS).index("3–5")
 """The group that the best baseline is chosen by, as in the paper's protocol."""
 NOMINAL = (0.5, 0.9)
 NONE = "–"
@@ -176,7 +177,7 @@ def score_tracks(
     """
     settings = manifest.settings
     shown = [p for p in predictors if p.name == PERSISTENCE or not any(n.frames for n in p.needs)]
-    groups = [slice(first - 1, last) for first, last in GROUPS.values()]
+    groups = [slice(first - 1, last) for first, last in TRACK_GROUPS.values()]
     result: list[TrackScores] = []
     with ProgressBar(len(stretches), "track", shown=progress, keep=False) as bar:
         for kind in dict.fromkeys(stretch.kind for stretch in stretches):
@@ -291,7 +292,7 @@ def tracks_markdown(
     for scores in all_scores:
         people = f"{len(scores.subjects)} people, {int(scores.frames.sum())} forecasts"
         parts.append(f"## {scores.kind}: {people}")
-        head = ["", *(f"{name} ahead" for name in GROUPS)]
+        head = ["", *(f"{name} ahead" for name in TRACK_GROUPS)]
         means = mean_errors(scores)
         rows = [
             [name, *(_cell(value, ".4f") for value in means[i])]
@@ -309,7 +310,7 @@ def tracks_markdown(
                         NONE
                         if np.isnan(value[i, g])
                         else f"{value[i, g]:+.1f} % ({low[i, g]:+.1f} to {high[i, g]:+.1f})"
-                        for g in range(len(GROUPS))
+                        for g in range(len(TRACK_GROUPS))
                     ),
                 ]
                 for i in networks
@@ -357,7 +358,7 @@ def people_csv(all_scores: Sequence[TrackScores]) -> str:
     """``people.csv``: a line for each kind, person and row."""
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
-    groups = [name.replace("–", "_") for name in GROUPS]
+    groups = [name.replace("–", "_") for name in TRACK_GROUPS]
     head = ["kind", "subject", "forecasts", "smoothness", "row", "role"]
     table.writerow([*head, *(f"error_{g}" for g in groups), *(f"held_90_{g}" for g in groups)])
     for scores in all_scores:
@@ -380,7 +381,7 @@ def tracks_record(
 ) -> Mapping[str, Any]:
     """The part ``tracks`` of ``results.json``."""
     result: dict[str, Any] = {
-        "horizon_groups": list(GROUPS.values()),
+        "horizon_groups": list(TRACK_GROUPS.values()),
         "nominal": list(NOMINAL),
         "warm_up": warm_up,
     }
@@ -413,7 +414,12 @@ def _rounded(values: Floats) -> list[float | None]:
 
 def write_tracks(
     folder: Path, all_scores: Sequence[TrackScores], resamples: int, seed: int, warm_up: int
-) -> None:
-    """Write ``tracks.md`` and ``people.csv``, each whole or not at all."""
-    write_text(folder / "tracks.md", tracks_markdown(all_scores, resamples, seed, warm_up))
-    write_text(folder / "people.csv", people_csv(all_scores))
+) -> list[Path]:
+    """Write ``tracks.md`` and ``people.csv``, each whole or not at all; return their paths."""
+    texts = {
+        "tracks.md": tracks_markdown(all_scores, resamples, seed, warm_up),
+        "people.csv": people_csv(all_scores),
+    }
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]

@@ -5,7 +5,7 @@ history is the landmarks 0, 1, 2, ... thirtieths of a second before it, between 
 straight line, and before the first frame at rest.
 
 Legend: N frames with the face, T frames of history, H horizon, L = 468 landmarks, P images at the
-end of the history, S their side, K neighbouring images that the features of one frame come from.
+end of the history, S their side.
 """
 
 from __future__ import annotations
@@ -105,33 +105,29 @@ class NetworkForecaster:
     def __init__(self, network: PredictorModel, name: str) -> None:
         self._network, self._name = network.eval(), name
         self._device = next(network.parameters()).device
-        self.needs, self.span = network.needs, network.span
+        self.needs = network.needs
         # a first run, which takes longer than others, before a camera waits for it
         still = np.zeros((network.history, NUM_LANDMARKS, 2), dtype=np.float32)
-        black = np.zeros((self.span, self.needs.size, self.needs.size, 3), dtype=np.uint8)
-        features = self.features(still[: self.span], black)
-        self.forecast(still, [features] * (self.needs.frames - self.span + 1), black[-1])
+        black = np.zeros((self.needs.size, self.needs.size, 3), dtype=np.uint8)
+        self.forecast(still, [self.features(still[0], black)] * self.needs.frames)
 
-    def features(self, landmarks: NDArray[np.float32], images: NDArray[np.uint8]) -> torch.Tensor:
-        """Features (1, 1, ...) of one frame, from landmarks (K, L, 2) and images (K, S, S, 3)."""
+    def features(self, landmarks: NDArray[np.float32], image: NDArray[np.uint8]) -> torch.Tensor:
+        """Features (1, 1, ...) of one frame, from its landmarks (L, 2) and image (S, S, 3)."""
         import torch
 
         with torch.inference_mode():
-            return self._network.encode(self._tensor(landmarks), self._tensor(images))
+            return self._network.encode(self._tensor(landmarks[None]), self._tensor(image[None]))
 
     def forecast(
-        self,
-        landmarks: NDArray[np.float32],
-        features: list[torch.Tensor],
-        last_image: NDArray[np.uint8],
+        self, landmarks: NDArray[np.float32], features: list[torch.Tensor]
     ) -> NDArray[np.float32]:
-        """Landmarks (H, L, 2) after those (T, L, 2), with P - K + 1 frames' features."""
+        """Landmarks (H, L, 2) after those (T, L, 2), with the features of P frames."""
         import torch
 
         with torch.inference_mode():
             seen = self._tensor(landmarks[-self._network.history :])
-            joined, last = torch.cat(features, dim=1), self._tensor(last_image)
-            ahead = self._network.decode(seen, joined, last, make_images=False).landmarks
+            joined = torch.cat(features, dim=1)
+            ahead = self._network.decode(seen, joined, make_images=False).landmarks
         if ahead is None:
             raise RequestError(f"{self._name}: forecasts images and no landmarks; use another")
         return ahead[0].float().cpu().numpy()
@@ -247,8 +243,8 @@ class StreamingPredictor:
         if isinstance(self._forecaster, LandmarkForecaster):
             ahead = self._forecaster.forecast(history)
         else:
-            features = self._features(self._forecaster, crop, wanted, times, points, size)
-            ahead = self._forecaster.forecast(history, features, self._cut(frames[-1], crop))
+            features = self._features(self._forecaster, crop, wanted, times, size)
+            ahead = self._forecaster.forecast(history, features)
             for frame in frames:  # too old to be looked at again, whatever the crop will be
                 if frame.time < wanted[-needs.frames] - MAX_GAP - SAME_TIME:
                     frame.image = frame.cut = None
@@ -299,19 +295,15 @@ class StreamingPredictor:
         crop: Crop,
         wanted: NDArray[np.float64],
         times: NDArray[np.float64],
-        points: NDArray[np.floating],
         size: tuple[int, int],
     ) -> list[Any]:
-        """Features of the frames nearest to the last P - K + 1 of the ``wanted`` times."""
-        count = network.needs.frames - network.span + 1
-        chosen = nearest(wanted[-count:], times).tolist()
+        """Features of the frames nearest to the last P of the ``wanted`` times."""
+        chosen = nearest(wanted[-network.needs.frames :], times).tolist()
         for number in sorted(set(chosen)):
             frame = self._frames[number]
             if frame.features is None:
-                back = times_back(frame.time, network.span, self._settings.fps)
-                near = crop.normalise(landmarks_at(back, times, points), size)
-                cuts = [self._cut(self._frames[n], crop) for n in nearest(back, times).tolist()]
-                frame.features = network.features(near[..., :2].astype(np.float32), np.stack(cuts))
+                points = crop.normalise(frame.landmarks, size)[:, :2].astype(np.float32)
+                frame.features = network.features(points, self._cut(frame, crop))
         return [self._frames[number].features for number in chosen]
 
     def _cut(self, frame: _Frame, crop: Crop) -> NDArray[np.uint8]:

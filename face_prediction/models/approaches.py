@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 from torch.nn import functional
 
 from face_prediction.forecast.interface import LandmarkSequences
@@ -163,7 +163,7 @@ class ApproachModel(PredictorModel):
 
     def __init__(self, settings: ApproachSettings) -> None:
         super().__init__()
-        self.history, self.horizon, self.span = settings.history, settings.horizon, 1
+        self.history, self.horizon = settings.history, settings.horizon
         self.needs = ImageNeeds(settings.history, settings.size)
         self.landmark_decoder, self.landmark_weight = None, 0.0
         self.image_encoder = ImageEncoder(settings.size, settings.channels, settings.width)
@@ -187,9 +187,7 @@ class ApproachModel(PredictorModel):
         """Return image features (B, N, D); landmarks are encoded in `decode`."""
         return self.image_encoder(images)
 
-    def decode(
-        self, landmarks: Tensor, features: Tensor, last_image: Tensor, make_images: bool = True
-    ) -> Output:
+    def decode(self, landmarks: Tensor, features: Tensor, make_images: bool = True) -> Output:
         """Predict images, and landmarks if this approach does; see `PredictorModel.decode`."""
         tokens = self.tokens(landmarks, features)
         future = tokens[:, -1:] + self.future.to(tokens.dtype)
@@ -235,7 +233,7 @@ class FusionModel(ApproachModel):
         """Return tokens (B, T, D) of landmark features (B, T, D_l) and image features (B, T, D)."""
 
     @torch.no_grad()
-    def prepare(self, sequences: LandmarkSequences, generator: Generator) -> None:
+    def prepare(self, sequences: LandmarkSequences) -> None:
         """Take the mean face and the landmarks' spread from all training frames."""
         landmarks = torch.as_tensor(sequences.landmarks, dtype=torch.float32)
         self.landmark_encoder.set_statistics(landmarks.flatten(0, 1))

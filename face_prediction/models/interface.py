@@ -1,7 +1,7 @@
 """Interface of the networks that predict faces, for the trainer and for `LearnedPredictor`.
 
 A network is a ``torch.nn.Module`` made from frozen settings. The trainer calls ``prepare`` once
-(statistics, a fitted prior), then ``loss`` on batches; a predictor calls ``forward``.
+(statistics), then ``loss`` on batches; a predictor calls ``forward``.
 
 Shapes: B batch, T frames of history, H horizon, L = 468 landmarks, S side of the images,
 P images at the end of the history, N frames.
@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from face_prediction.forecast.interface import LandmarkSequences
 from face_prediction.prediction.interface import ImageNeeds
@@ -51,14 +51,10 @@ class Output:
     Attributes:
         landmarks: (B, H, L, 2).
         images: (B, H, 3, S, S), 0 to 1.
-        mouth_scale: (B, H, 2) scale of the mouth centre's error, in crops.
-        degrees_of_freedom: (H, 2) of that error (Student-t).
     """
 
     landmarks: Tensor | None = None
     images: Tensor | None = None
-    mouth_scale: Tensor | None = None
-    degrees_of_freedom: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -79,37 +75,31 @@ class PredictorModel(nn.Module, ABC):
         history: T, frames of landmarks in the input.
         horizon: H, frames predicted.
         needs: images in the input.
-        span: neighbouring images that the features of one frame come from: 1, or 2 where
-            differences between frames count.
     """
 
     history: int
     horizon: int
     needs: ImageNeeds
-    span: int
 
-    def prepare(self, sequences: LandmarkSequences, generator: Generator) -> None:
+    def prepare(self, sequences: LandmarkSequences) -> None:
         """Set buffers from the training landmarks, whole sequences (75 frames), before training."""
 
     @abstractmethod
     def encode(self, landmarks: Tensor, images: Tensor) -> Tensor:
-        """Return features (B, N - span + 1, ...) of the last images, one row a frame.
+        """Return features (B, N, ...), those of a frame from its landmarks and image alone.
 
         Args:
             landmarks: (B, N, L, 2) of the same frames as the images.
-            images: (B, N, S, S, 3) uint8; N is ``span`` or more.
+            images: (B, N, S, S, 3) uint8.
         """
 
     @abstractmethod
-    def decode(
-        self, landmarks: Tensor, features: Tensor, last_image: Tensor, make_images: bool = True
-    ) -> Output:
+    def decode(self, landmarks: Tensor, features: Tensor, make_images: bool = True) -> Output:
         """Predict H frames.
 
         Args:
             landmarks: (B, T, L, 2).
-            features: (B, P - span + 1, ...) from `encode`.
-            last_image: (B, S, S, 3) uint8, of the last frame.
+            features: (B, P, ...) from `encode`.
             make_images: False where `Output.images` is not needed.
         """
 
@@ -121,4 +111,4 @@ class PredictorModel(nn.Module, ABC):
         """Predict the H frames after ``history``."""
         frames = history.images.shape[1]
         features = self.encode(history.landmarks[:, -frames:], history.images)
-        return self.decode(history.landmarks, features, history.images[:, -1])
+        return self.decode(history.landmarks, features)

@@ -89,20 +89,6 @@ class LearnedPredictor:
         load_tensors(model, tensors, folder / MODEL_FILE)
         return cls(model.to(device), record, batch_size)
 
-    @property
-    def test_fold(self) -> int:
-        """Fold of people that the network may be evaluated on.
-
-        Raises:
-            RequestError: there is none: it was trained on everybody.
-        """
-        if not self.record.folds["test"]:
-            raise RequestError(
-                f"this {self.name} was trained on the people of all folds and can be judged on "
-                "none of them; train one with --test_fold"
-            )
-        return self.record.folds["test"][0]
-
     def predict(
         self, landmarks: NDArray[np.floating], images: NDArray[np.uint8] | None, horizon: int
     ) -> Forecast:
@@ -120,20 +106,16 @@ class LearnedPredictor:
         images = self._checked_images(images, len(landmarks))
         device = next(self.model.parameters()).device
         batches: list[dict[str, NDArray[Any]]] = []
-        freedom = None
         for first in range(0, len(landmarks), self._batch_size):
             rows = slice(first, first + self._batch_size)
             seen = torch.tensor(landmarks[rows], dtype=torch.float32, device=device)
             with torch.inference_mode():
                 output = self.model(History(seen, torch.tensor(images[rows], device=device)))
             batches.append(_arrays(output, horizon))
-            freedom = output.degrees_of_freedom
         joined = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
         if "landmarks" not in joined:
             shape = (len(landmarks), horizon, NUM_LANDMARKS, 2)
             joined["landmarks"] = np.full(shape, np.nan, dtype=np.float32)
-        if freedom is not None:
-            joined["degrees_of_freedom"] = freedom[:horizon].double().cpu().numpy()
         return Forecast(**joined)
 
     def _checked_landmarks(self, landmarks: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -162,9 +144,8 @@ class LearnedPredictor:
 def _arrays(output: Output, horizon: int) -> dict[str, NDArray[Any]]:
     """Return the outputs that there are, by name, for the first ``horizon`` frames."""
     arrays = {}
-    for name in ("landmarks", "mouth_scale"):
-        if (values := getattr(output, name)) is not None:
-            arrays[name] = values[:, :horizon].float().cpu().numpy()
+    if output.landmarks is not None:
+        arrays["landmarks"] = output.landmarks[:, :horizon].float().cpu().numpy()
     if output.images is not None:
         images = (255 * output.images[:, :horizon].float()).round().clamp(0, 255).to(torch.uint8)
         arrays["images"] = images.permute(0, 1, 3, 4, 2).contiguous().cpu().numpy()

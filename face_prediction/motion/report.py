@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from face_prediction.markdown import markdown_table
 from face_prediction.motion.library import LiftedClip, RecordedMotion
 from face_prediction.motion.motion import IDENTITY, ClipMotion
 from face_prediction.motion.splice import SplicedClip
@@ -39,12 +40,6 @@ CUT_COLOURS = {
 """Label and colour of each class of frames that is cut; spikes count as no face."""
 SPLICE_COLOURS = {"blended": ("blended", "#56B4E9"), "mirrored": ("played backwards", "#CCCCCC")}
 """Label and colour of marked samples of spliced motion."""
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """Lines of a table in Markdown."""
-    lines = [f"| {' | '.join(map(str, cells))} |" for cells in (head, *rows)]
-    return [lines[0], "|" + "---|" * len(head), *lines[1:]]
 
 
 def splice_tables(library: RecordedMotion) -> str:

@@ -45,6 +45,7 @@ from face_prediction.models.settings import (
 from face_prediction.prediction.errors import mouth_distances, mouth_residuals
 from face_prediction.training.options import FaceTrainOptions
 from face_prediction.training.windows import SequenceWindows, WindowBatch, augment, window_batches
+from robo_manip_baselines.runs.command import EXIT_INTERRUPTED
 from robo_manip_baselines.runs.documents import Schema, convert
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import (
@@ -130,8 +131,7 @@ def train_predictor(options: FaceTrainOptions) -> int:
             memory *= 1 - _VALIDATION_SHARE
         windows = SequenceWindows(dataset, people.train, model, memory)
         if found is None:
-            generator = torch.Generator().manual_seed(torch_seed(options.seed, "prepare"))
-            model.prepare(windows.sequences, generator)
+            model.prepare(windows.sequences)
         trainer = PredictorTrainer(options, settings, record, model.to(device), windows, validation)
         if found is not None:
             trainer.restore(*found)
@@ -142,9 +142,10 @@ def train_predictor(options: FaceTrainOptions) -> int:
         )
         trainer.train(stop)
     write_curves(folder / "curves.png", read_metrics(folder / METRICS_FILE), folder.name, CURVES)
-    end = "stopped; the same command carries on" if stop.is_made else "done"
+    is_done = trainer.progress.step == settings.steps
+    end = "done" if is_done else "stopped; the same command carries on"
     logger.info("%s: %s", folder, end)
-    return 130 if stop.is_made else 0
+    return 0 if is_done else EXIT_INTERRUPTED
 
 
 @dataclass(frozen=True)
@@ -250,10 +251,10 @@ def _is_run(folder: Path) -> bool:
 
 
 def _is_begun(path: Path) -> bool:
-    lines = read_metrics(path) if path.name == METRICS_FILE else [{}]
-    return all(isinstance(line, dict) and {"kind", "step"} <= line.keys() for line in lines) and (
-        len(lines) == path.read_bytes().count(b"\n")
-    )
+    if path.name != METRICS_FILE:
+        return False
+    read_metrics(path)  # refuses what no training wrote
+    return True
 
 
 _RUN = FolderKind("run of face-prediction train", _is_run, begun=_is_begun)

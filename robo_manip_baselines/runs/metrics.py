@@ -262,7 +262,7 @@ def write_curves(
         axes.grid(True, which="both", alpha=0.3)
         if axes.lines and validation and (place == 0 or len(names) > 1):
             axes.legend()
-    # A name of a folder: no formula, and bytes that are no UTF-8 cannot be drawn.
+    # It may be the name of a folder: no formula, and bytes that are no UTF-8 cannot be drawn.
     readable = title.encode(errors="replace").decode()
     figure.suptitle(readable, parse_math=False)
     with atomic_file(path) as temporary:

@@ -174,7 +174,7 @@ def test_coverage_is_the_share_inside(scores: EvaluationScores, summary: KindSum
 def test_shuffled_images(scores: EvaluationScores) -> None:
     scores.row("net").shuffled_residuals[:] = 3 * scores.row("net").residuals
     scores.row("blurred").shuffled_residuals[:] = scores.row("blurred").residuals
-    found = summarise_kind(scores, "natural", resamples=50).numbers["exchanged"]
+    found = summarise_kind(scores, "natural", resamples=50).numbers["shuffled_images"]
     np.testing.assert_allclose(found.value[2], [200.0] * 3)
     np.testing.assert_allclose(found.low[2], [200.0] * 3)
     np.testing.assert_array_equal(found.value[3], [0.0] * 3)

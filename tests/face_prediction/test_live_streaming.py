@@ -28,14 +28,14 @@ SIZE = (320, 240)
 SETTINGS = SequenceSettings(history=8, future=5, crop_size=64)
 
 
-def toy(history: int = 8, pictures: int = 5, span: int = 1, landmarks: bool = True):
+def toy(history: int = 8, pictures: int = 5, landmarks: bool = True):
     """A network whose every sum is of whole numbers: the same whatever is computed together."""
     from face_prediction.models.interface import Output, PredictorModel
 
     class Toy(PredictorModel):
         def __init__(self) -> None:
             super().__init__()
-            self.history, self.horizon, self.span = history, 5, span
+            self.history, self.horizon = history, 5
             self.needs = ImageNeeds(pictures, 32)
             self.weight = torch.nn.Parameter(torch.tensor(1e-7, dtype=torch.float64))
             self.encoded: list[int] = []
@@ -44,16 +44,13 @@ def toy(history: int = 8, pictures: int = 5, span: int = 1, landmarks: bool = Tr
             self.encoded.append(pictures.shape[1])
             whole = pictures.double().sum(dim=(2, 3, 4))  # (B, N)
             place = (landmarks[:, :, 13, 0].double() * 1000).round()
-            new = whole + 3 * place
-            old = new[:, : new.shape[1] - span + 1]
-            return torch.stack([new[:, span - 1 :], new[:, span - 1 :] - old], dim=-1)
+            return torch.stack([whole, 3 * place], dim=-1)
 
-        def decode(self, landmarks, features, last_image, make_images=True):
+        def decode(self, landmarks, features, make_images=True):
             assert landmarks.shape[1:] == (history, 468, 2)
-            assert features.shape[1] == pictures - span + 1
+            assert features.shape[1] == pictures
             order = torch.arange(1, features.shape[1] + 1, dtype=torch.float64)
             mixed = (features * order[None, :, None]).sum(dim=(1, 2))
-            mixed = mixed + last_image.double().sum(dim=(1, 2, 3))
             ahead = landmarks[:, -1:] + (landmarks[:, -1:] - landmarks[:, :1])
             steps = torch.arange(1, 6, dtype=torch.float64)[None, :, None, None]
             moved = (ahead.double() + self.weight * mixed[:, None, None, None] * steps).float()
@@ -104,10 +101,9 @@ def in_crop(forecast: LiveForecast) -> np.ndarray:
     return ((forecast.landmarks * SIZE - [crop.left, crop.top]) / crop.side).astype(np.float32)
 
 
-@pytest.mark.parametrize("span", [1, 2, 3])
 @pytest.mark.parametrize("history", [8, 6])
-def test_it_is_the_batch_predictor_to_the_last_bit(make_track, span: int, history: int) -> None:
-    model = toy(history=history, span=span)
+def test_it_is_the_batch_predictor_to_the_last_bit(make_track, history: int) -> None:
+    model = toy(history=history)
     stream = StreamingPredictor(NetworkForecaster(model, "toy"), SETTINGS)
     landmarks, images = sway(make_track, 40), pictures(40)
     laid = 0
@@ -122,13 +118,13 @@ def test_it_is_the_batch_predictor_to_the_last_bit(make_track, span: int, histor
 
 
 def test_a_frame_costs_one_encoding_while_the_crop_holds(make_track) -> None:
-    model = toy(span=2)
+    model = toy()
     stream = StreamingPredictor(NetworkForecaster(model, "toy"), SETTINGS)
     landmarks, images = sway(make_track, 30, amplitude=0.001), pictures(30)
     model.encoded.clear()
     for now in range(30):
         stream.update(now / 30, landmarks[now], images[now])
-    assert model.encoded == [2] * 30  # two pictures each: the newest and the one before it
+    assert model.encoded == [1] * 30
 
 
 def test_a_new_crop_encodes_what_still_counts(make_track) -> None:

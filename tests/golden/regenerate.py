@@ -227,7 +227,7 @@ def face_step(name: str) -> dict[str, Any]:
     model = make_predictor_model(name, settings_class(name)().changed(FACE_SETTINGS[name]))
     fill_parameters(model)
     faces = LandmarkSequences(moving_faces(4, 9).numpy(), tuple("abcd"))
-    model.prepare(faces, torch.Generator())
+    model.prepare(faces)
     landmarks = moving_faces(2, model.history + model.horizon)
     frames = model.needs.frames
     images = (127.5 + fill((2, frames + model.horizon, 32, 32, 3), 6, 127.5)).to(torch.uint8)

@@ -16,6 +16,8 @@ from face_prediction.dataset.tracks import dataset_stretches
 from face_prediction.evaluation import predictors
 from face_prediction.forecast import Forecaster, LandmarkSequences
 from face_prediction.forecast.interface import mouth_centre
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import write_json
 
 from .conftest import rows_of, run
 
@@ -139,6 +141,46 @@ def test_the_same_command_gives_the_same_bytes(dataset: Path, tmp_path: Path, to
     record = run(dataset, tmp_path / "c", "reader_0", max_sequences=5, seed=1)
     assert record["kinds"]["natural"]["sequences"] == 5
     assert "Of each kind at most 5 sequences" in (tmp_path / "c" / "tables.md").read_text()
+
+
+def test_files_of_an_earlier_evaluation_are_removed(dataset: Path, tmp_path: Path, toys) -> None:
+    tables = {"tables.md", "table1.csv", "table2.csv"}
+    tracks = {"tracks.md", "people.csv"}
+    pictures = {"errors.png", "forecast.mp4", "forecast_natural_persistence.png"}
+    only = {"kinds": ("natural",), "max_sequences": 6}
+    networks = "reader_0", "reader_1"
+    of_network = {"calibration.png", "forecast_natural_reader.png"}
+    for checkpoints, options, expected in (
+        (networks, {"figures": True}, tables | tracks | pictures | of_network),
+        ((), {"figures": True}, tables | tracks | pictures),
+        ((), {"figures": True, "tracks": False}, tables | pictures),
+        ((), {"tracks": False}, tables),
+    ):
+        record = run(dataset, tmp_path, *checkpoints, **only, **options)
+        (tmp_path / "notes.txt").touch()
+        assert record["files"] == sorted(expected)
+        assert {p.name for p in tmp_path.iterdir()} == expected | {"results.json", "notes.txt"}
+
+
+def test_files_that_no_evaluation_has_listed_are_kept(dataset: Path, tmp_path: Path) -> None:
+    out, outside = tmp_path / "out", tmp_path / "mine.txt"
+    quick = {"kinds": ("natural",), "max_sequences": 2, "tracks": False}
+    record = run(dataset, out, **quick)
+    outside.touch()
+    (out / "gains.png").touch()
+    (out / "folder").mkdir()
+    del record["files"]  # as earlier releases wrote it
+    write_json(out / "results.json", record)
+    again = run(dataset, out, **quick)
+    assert (out / "gains.png").exists()
+    listed = [*again["files"], "../mine.txt", str(outside), "..", ".", "", "folder", "absent.png"]
+    write_json(out / "results.json", {**record, "files": listed})
+    assert run(dataset, out, **quick) == again
+    assert outside.exists()
+    assert (out / "folder").exists()
+    write_json(out / "results.json", {**record, "files": "gains.png"})
+    with pytest.raises(RequestError, match=r"results.json': files: must be a list"):
+        run(dataset, out, **quick)
 
 
 def test_a_network_of_pictures_only_is_looked_at_by_the_detector(

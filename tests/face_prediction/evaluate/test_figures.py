@@ -13,7 +13,7 @@ import pytest
 from face_prediction.dataset.clip_file import open_clip, read_array
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.evaluation import figures
-from face_prediction.evaluation.tracks import GROUPS, TrackScores
+from face_prediction.evaluation.tracks import TRACK_GROUPS, TrackScores
 from face_prediction.evaluation.video import (
     FORECASTS,
     PAUSE,
@@ -57,11 +57,14 @@ def test_figures_and_video(dataset: Path, tmp_path: Path, toys) -> None:
 def test_gains_of_a_few_people_have_their_names(tmp_path: Path, monkeypatch, people: int) -> None:
     drawn = []
     monkeypatch.setattr(figures, "_save_png", lambda figure, path: drawn.append(figure))
-    errors = np.ones((people, 2, len(GROUPS)))
+    errors = np.ones((people, 2, len(TRACK_GROUPS)))
     errors[:, 1] = np.linspace(0.5, 1.5, people)[:, None]
     names = tuple(f"p{i}" for i in range(people))
     frames, rows = np.full(people, 90), (("persistence", "baseline"), ("net", "network"))
-    counts, inside = np.ones((people, len(GROUPS))), np.full((people, 2, len(GROUPS), 2), np.nan)
+    counts, inside = (
+        np.ones((people, len(TRACK_GROUPS))),
+        np.full((people, 2, len(TRACK_GROUPS), 2), np.nan),
+    )
     smooth = np.linspace(0.1, 0.9, people)
     scores = TrackScores("natural", names, frames, smooth, rows, errors, counts, inside)
     figures.draw_gains(tmp_path / "gains.png", [scores])

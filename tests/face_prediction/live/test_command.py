@@ -15,6 +15,8 @@ import pytest
 
 from face_prediction.commands import live as live_command
 from face_prediction.commands.live import LiveOptions, run_live
+from face_prediction.dataset.manifest import Manifest, write_manifest
+from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.live import loop as display
 from face_prediction.tracking.detector import find_model
 from face_prediction.tracking.video import VideoFrame, VideoReader
@@ -146,6 +148,14 @@ def test_what_cannot_be_done_is_refused(clip, faces, tmp_path, changes, message:
         run_live(replace(options, **changes))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out.mp4").exists()
+
+
+def test_a_dataset_without_sequences_is_refused(clip, faces, tmp_path: Path) -> None:
+    dataset = tmp_path / "faces"
+    write_manifest(dataset, Manifest(SequenceSettings(), folds=2, seed=0, clips=()))
+    options = LiveOptions(video=clip, checkpoint="ar_landmarks", dataset=dataset)
+    with pytest.raises(RequestError, match="faces: no sequence of anybody to fit to"):
+        run_live(options)
 
 
 def test_without_a_model_the_option_that_live_has_is_named(clip, tmp_path, monkeypatch) -> None:

@@ -157,3 +157,19 @@ def test_ctrl_c_and_the_same_command_again(options, whole: Path, before_step) ->
     assert state["progress"]["step"] == 8
     assert run_train(options) == 0
     require_same_run(options.folder, whole)
+
+
+@quick
+def test_ctrl_c_in_the_last_step_is_no_interruption(
+    options, whole: Path, before_step, caplog
+) -> None:
+    caplog.set_level("INFO")
+
+    def interrupt(step: int, batch: WindowBatch) -> None:
+        if step == options.steps - 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before_step(interrupt)
+    assert run_train(options) == 0
+    assert f"{options.folder}: done" in caplog.text
+    require_same_run(options.folder, whole)
