@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from robo_manip_baselines.benchmark.statistics.inference import paired_success, rate_estimate
 from robo_manip_baselines.benchmark.statistics.outcomes import (
@@ -28,7 +27,6 @@ from robo_manip_baselines.benchmark.statistics.outcomes import (
     outcome_matrix,
 )
 from robo_manip_baselines.commands.train import parse_config
-from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims
 from robo_manip_baselines.rollout.evaluation import (
     FIRST_SEED,
@@ -42,19 +40,25 @@ from robo_manip_baselines.runs.documents import convert, parse_json, read_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_json, write_text
 from robo_manip_baselines.runs.ranges import Count, Episodes, NonNegativeInt, Processes, Seed
-from robo_manip_baselines.training.batching import BatchLoader
 from robo_manip_baselines.training.config import (
     CONFIG,
     TrainConfig,
     read_config,
     require_same_config,
 )
-from robo_manip_baselines.training.device import StepTimer
 from robo_manip_baselines.training.requirements import prepare_pytorch
-from robo_manip_baselines.training.setup import TrainSetup
-from robo_manip_baselines.training.state import TrainerState
-from robo_manip_baselines.training.step import TrainingStep
-from robo_manip_baselines.training.trainer import train
+
+prepare_pytorch()  # before PyTorch is imported: how its threads wait
+
+import torch  # noqa: E402
+
+from robo_manip_baselines.policy.execution import PolicyRunner  # noqa: E402
+from robo_manip_baselines.training.batching import BatchLoader  # noqa: E402
+from robo_manip_baselines.training.device import StepTimer  # noqa: E402
+from robo_manip_baselines.training.setup import TrainSetup  # noqa: E402
+from robo_manip_baselines.training.state import TrainerState  # noqa: E402
+from robo_manip_baselines.training.step import TrainingStep  # noqa: E402
+from robo_manip_baselines.training.trainer import train  # noqa: E402
 
 EXAMPLE = "python benchmarks/policies.py --dataset dataset/dyskinetic --policies Act Flow"
 
@@ -79,6 +83,9 @@ EPISODES, ROWS = "episodes", "rows"
 
 TIMED_STEPS = 20
 """Steps of training whose processor time is measured; the median counts."""
+
+TIMED_PREDICTIONS = 50
+"""Predictions whose processor time is measured."""
 
 TIMED_EPISODES = 4
 """Demonstrations that are read to measure times alone."""
@@ -283,7 +290,7 @@ def time_training(setup: TrainSetup) -> float:
 
 
 def time_prediction(
-    policy: ActingPolicy, execution: ActionExecution, dims: PolicyDims, repeats: int = 50
+    policy: ActingPolicy, execution: ActionExecution, dims: PolicyDims
 ) -> tuple[float, float]:
     """Return ms of one thread's processor time: of a prediction, and of the mean action."""
     torch.set_num_threads(1)
@@ -291,7 +298,7 @@ def time_prediction(
     policy.reset(env, [0])
     every = 1 if execution.temporal_ensemble else execution.n_action_steps
     times: list[float] = []
-    for _ in range(repeats * every):
+    for _ in range(TIMED_PREDICTIONS * every):
         begin = time.process_time()
         policy.act(np.zeros((1, dims.state), np.float32), None, env)
         times.append(1e3 * (time.process_time() - begin))
@@ -408,7 +415,6 @@ def _percent(share: Proportion | None) -> str:
 def main() -> None:
     """Run the command."""
     options = parse(Options, EXAMPLE)
-    prepare_pytorch()
     options.out.mkdir(parents=True, exist_ok=True)
     if options.only_times:
         write_text(options.out / TIMES, times_table(options))
