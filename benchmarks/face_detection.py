@@ -31,6 +31,8 @@ from robo_manip_baselines.envs.mujoco.face.motion import SEGMENT_DURATION, Motio
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET
 from robo_manip_baselines.envs.mujoco.tasks.face_scene import PARKED_QPOS
 from robo_manip_baselines.observation.spec import ARM_JOINTS
+from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA, WIDTH, HEIGHT = "front_close", 640, 480
@@ -194,6 +196,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", type=Path, default=ROOT / "docs/images")
     options = parser.parse_args()
+    if options.frames < 1:
+        raise RequestError(f"--frames {options.frames}: must be 1 or more")
+    if not options.model.is_file():
+        raise RequestError(f"--model {options.model}: no such file; give face_landmarker.task")
     views = list(recorded_views(options.frames, options.seed))
     errors = mouth_errors(views, options.model)
     print(table(views, errors))
@@ -201,4 +207,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)
