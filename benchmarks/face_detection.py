@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
@@ -75,16 +76,6 @@ def place_face(
     mujoco.mj_forward(model, data)
 
 
-def projected(
-    model: mujoco.MjModel, data: mujoco.MjData, camera: str, point: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Pixel (column, row) of a world point (3,) in a `WIDTH` x `HEIGHT` image."""
-    eye = data.camera(camera)
-    x, y, z = eye.xmat.reshape(3, 3).T @ (point - eye.xpos)
-    focal = HEIGHT / 2 / np.tan(np.deg2rad(model.camera(camera).fovy[0]) / 2)
-    return np.array([WIDTH / 2 + focal * x / -z, HEIGHT / 2 - focal * y / -z])
-
-
 def recorded_views(count: int, seed: int) -> Iterator[View]:
     """Draw ``count`` frames from all runs in turn, as episodes would show them."""
     rng = np.random.default_rng(seed)
@@ -99,9 +90,8 @@ def recorded_views(count: int, seed: int) -> Iterator[View]:
             mouth = MOUTH + rng.uniform(-FACE_OFFSET, FACE_OFFSET, 3) + moved
             place_face(model, data, mouth, orientation, float(jaw) + REST_OPENING)
             renderer.update_scene(data, CAMERA)
-            yield View(
-                renderer.render().copy(), projected(model, data, CAMERA, mouth), segment.clip
-            )
+            at = project(model, data, CAMERA, mouth, (HEIGHT, WIDTH))
+            yield View(renderer.render().copy(), at, segment.clip)
 
 
 def mouth_errors(views: Sequence[View], model_file: Path) -> NDArray[np.float64]:
