@@ -34,6 +34,8 @@ from robo_manip_baselines.envs.mujoco.tasks.face_scene import PARKED_QPOS
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.images import encode_image
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA, WIDTH, HEIGHT = "front_close", 640, 480
@@ -174,8 +176,9 @@ def closeups(poses: Sequence[tuple[float, float, float, float]]) -> NDArray[np.u
 
 
 def save(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an RGB image."""
-    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    """Write an RGB image as PNG."""
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(encode_image(image, "png").tobytes())
 
 
 def main() -> None:
