@@ -189,8 +189,9 @@ def run(options: Options, policy: str, observation: str, train_seed: int) -> Row
     """
     name = run_name(policy, observation, train_seed)
     config = configure(options, policy, observation, train_seed)
-    require_same_run(config)
     file, episodes = options.out / ROWS / f"{name}.json", options.out / EPISODES / name
+    if file.is_file() or (episodes / MANIFEST).is_file():  # before, more steps extend the training
+        require_same_run(config)
     if file.is_file():
         done = read_row(file)
         if done.seed == options.seed and done.episodes >= options.num_episodes:
@@ -230,7 +231,10 @@ def require_same_run(config: TrainConfig[Any]) -> None:
     run = config.folder
     if not (run / CONFIG).is_file():
         return
-    require_same_config(run, config)
+    try:
+        require_same_config(run, config)
+    except RequestError as error:  # this command has no --resume
+        raise RequestError(str(error).replace("--resume extends it, ", "")) from error
     if read_config(run / CONFIG).get("dataset") != config.to_json()["dataset"]:
         TrainSetup.load(config).find_start(resume=True)  # compares what the folders hold
 

@@ -107,7 +107,7 @@ def test_other_settings_are_refused(policies: ModuleType, tmp_path: Path) -> Non
     assert policies.run(options, "Mlp", "default", 3).episodes == 10
     for name, changes in {
         "holds a run with delay 0, not 2": {"delay": 2},
-        "holds a run with steps 100, not 200": {"steps": 200},
+        "holds a run with steps 100, not 200; choose another --out": {"steps": 200},
         "holds episodes from seed 1000 on, not 2000": {"seed": 2000},
         "other": {"dataset": tmp_path / "other"},  # there are no demonstrations to compare
     }.items():
