@@ -81,7 +81,8 @@ class Options:
         size: Side of the images in the preset cpu.
         settings: Settings of all networks, as NAME=VALUE: landmark_weight=468 is equation 4 to the
             letter (not of image_only). Give such trainings another --out.
-        steps: Optimiser steps of each training; a larger number extends trainings.
+        steps: Optimiser steps of each training; a larger number extends trainings. One that was
+            begun with more is trained to that number.
         batch_size: Sequences of a step.
         learning_rates: Learning rates. Of several, the one that does best on the validation part of
             the first seed is used for all.
@@ -157,10 +158,14 @@ class Training:
 
 
 def train(options: Options, training: Training) -> Path:
-    """Train, carry on or extend; return the folder.
+    """Train, carry on or extend; return the folder of a training that is done.
+
+    One that was begun with more steps than ``options.steps`` goes on to the number it was begun
+    with: its learning rate may depend on that number, and the steps that are done are kept.
 
     Raises:
-        RequestError: the training was interrupted, or cannot be done.
+        RequestError: the training was interrupted, the folder holds one of other settings, or it
+            cannot be done.
     """
     network, settings = APPROACHES[training.approach]
     folder = options.out / RUNS / training.name
@@ -168,9 +173,9 @@ def train(options: Options, training: Training) -> Path:
         if not (folder / "config.json").is_file():
             run_fit(FitOptions(options.dataset, training.seed, training.split, out=folder))
         return folder
-    done = folder / "config.json"
-    if done.is_file() and read_json(done)["training"]["steps"] >= options.steps:
-        return folder
+    steps, config = options.steps, folder / "config.json"
+    if config.is_file():  # of what is saved so far
+        steps = max(steps, read_json(config)["training"]["steps"])
     sizes = (f"size={options.size}", f"channels={list(CHANNELS[options.size])}")
     given = FaceTrainOptions(
         model=network,  # type: ignore[arg-type]
@@ -181,7 +186,7 @@ def train(options: Options, training: Training) -> Path:
         seed=training.seed,
         preset=options.preset,
         settings=(*(sizes if options.preset == "cpu" else ()), *settings, *options.settings),
-        steps=options.steps,
+        steps=steps,
         batch_size=options.batch_size,
         learning_rate=training.learning_rate,
         schedule=options.schedule,

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from robo_manip_baselines.data import EpisodeReader, list_episodes
 from robo_manip_baselines.data.demonstrations import Demonstrations, load_demonstrations
@@ -22,15 +21,21 @@ from robo_manip_baselines.data.normalization import mean_std
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
 from robo_manip_baselines.observation.images import fit_image
 from robo_manip_baselines.observation.spec import parse_image_size
-from robo_manip_baselines.policy.interface import PolicyModel
 from robo_manip_baselines.rollout.demonstrate import Collection, collect
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.images import decode_image
 from robo_manip_baselines.runs.threads import processors
-from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler
-from robo_manip_baselines.training.device import choose_device
 from robo_manip_baselines.training.images import ImageStore
+from robo_manip_baselines.training.requirements import prepare_pytorch
+
+prepare_pytorch()  # before PyTorch is imported: how its threads wait
+
+import torch  # noqa: E402
+
+from robo_manip_baselines.policy.interface import PolicyModel  # noqa: E402
+from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler  # noqa: E402
+from robo_manip_baselines.training.device import choose_device  # noqa: E402
 
 EXAMPLE = "python benchmarks/batch_loading.py --batch_size 8 --image_size 240x320"
 

@@ -24,6 +24,7 @@ from robo_manip_baselines.envs.mujoco.tasks.safety import (
     summarize_safety,
 )
 from robo_manip_baselines.runs.command import parse, run_command
+from robo_manip_baselines.runs.files import atomic_file
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,8 @@ def main() -> None:
     if options.figure:
         with styled_figure("agg", "white") as figure:
             draw_faces(figure, panels)
-            figure.savefig(options.figure, dpi=150)
+            with atomic_file(options.figure) as temporary:
+                figure.savefig(temporary, format="png", dpi=150)
 
 
 if __name__ == "__main__":

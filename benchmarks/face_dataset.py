@@ -30,6 +30,8 @@ from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import CropFrom, clip_frames, find_sequences
 from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import load_track
+from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 
 def sizes(dataset: FaceDataset) -> tuple[Counter[str], int, int]:
@@ -136,6 +138,8 @@ def main() -> None:
     options = parser.parse_args()
     cv2.setNumThreads(1)
     with FaceDataset(options.dataset) as dataset:
+        if not len(dataset):
+            raise RequestError(f"'{options.dataset}': holds no sequence")
         if options.tracks:
             print(crop_table(dataset, options.tracks))
             return
@@ -168,4 +172,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

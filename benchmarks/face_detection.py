@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, build_cell
 from robo_manip_baselines.envs.mujoco.cell.vx300s import HOME_QPOS
 from robo_manip_baselines.envs.mujoco.face import REST_OPENING, FaceModel, add_face
@@ -31,6 +32,10 @@ from robo_manip_baselines.envs.mujoco.face.motion import SEGMENT_DURATION, Motio
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FACE_OFFSET
 from robo_manip_baselines.envs.mujoco.tasks.face_scene import PARKED_QPOS
 from robo_manip_baselines.observation.spec import ARM_JOINTS
+from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
+from robo_manip_baselines.runs.images import encode_image
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA, WIDTH, HEIGHT = "front_close", 640, 480
@@ -73,16 +78,6 @@ def place_face(
     mujoco.mj_forward(model, data)
 
 
-def projected(
-    model: mujoco.MjModel, data: mujoco.MjData, camera: str, point: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Pixel (column, row) of a world point (3,) in a `WIDTH` x `HEIGHT` image."""
-    eye = data.camera(camera)
-    x, y, z = eye.xmat.reshape(3, 3).T @ (point - eye.xpos)
-    focal = HEIGHT / 2 / np.tan(np.deg2rad(model.camera(camera).fovy[0]) / 2)
-    return np.array([WIDTH / 2 + focal * x / -z, HEIGHT / 2 - focal * y / -z])
-
-
 def recorded_views(count: int, seed: int) -> Iterator[View]:
     """Draw ``count`` frames from all runs in turn, as episodes would show them."""
     rng = np.random.default_rng(seed)
@@ -97,9 +92,8 @@ def recorded_views(count: int, seed: int) -> Iterator[View]:
             mouth = MOUTH + rng.uniform(-FACE_OFFSET, FACE_OFFSET, 3) + moved
             place_face(model, data, mouth, orientation, float(jaw) + REST_OPENING)
             renderer.update_scene(data, CAMERA)
-            yield View(
-                renderer.render().copy(), projected(model, data, CAMERA, mouth), segment.clip
-            )
+            at = project(model, data, CAMERA, mouth, (HEIGHT, WIDTH))
+            yield View(renderer.render().copy(), at, segment.clip)
 
 
 def mouth_errors(views: Sequence[View], model_file: Path) -> NDArray[np.float64]:
@@ -182,8 +176,9 @@ def closeups(poses: Sequence[tuple[float, float, float, float]]) -> NDArray[np.u
 
 
 def save(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an RGB image."""
-    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    """Write an RGB image as PNG."""
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(encode_image(image, "png").tobytes())
 
 
 def main() -> None:
@@ -194,6 +189,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", type=Path, default=ROOT / "docs/images")
     options = parser.parse_args()
+    if options.frames < 1:
+        raise RequestError(f"--frames {options.frames}: must be 1 or more")
+    if not options.model.is_file():
+        raise RequestError(f"--model {options.model}: no such file; give face_landmarker.task")
     views = list(recorded_views(options.frames, options.seed))
     errors = mouth_errors(views, options.model)
     print(table(views, errors))
@@ -201,4 +200,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

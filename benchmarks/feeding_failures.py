@@ -15,6 +15,7 @@ import numpy as np
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
 from robo_manip_baselines.envs.mujoco.tasks.feeding.success import MOUTH_TOLERANCE
 from robo_manip_baselines.rollout.results import EpisodeResult, read_rows
+from robo_manip_baselines.runs.command import run_command
 
 BLIND = "baseline"
 """Condition that does not observe the mouth where there are no images."""
@@ -41,11 +42,13 @@ def failures(results: Sequence[EpisodeResult]) -> None:
     seeing = [r for r in results if r.condition != BLIND]
     failed = Counter(r.seed for r in seeing if not r.is_success)
     hard = [count for count in failed.values() if count >= MANY]
-    print(
-        f"{failed.total()} failures of {len({r.condition for r in seeing})} conditions, "
-        f"{sum(hard) / failed.total():.0%} of them in {len(hard)} episodes "
-        f"in which {MANY} or more fail"
-    )
+    text = f"{failed.total()} failures of {len({r.condition for r in seeing})} conditions"
+    if failed:
+        text += (
+            f", {sum(hard) / failed.total():.0%} of them in {len(hard)} episodes "
+            f"in which {MANY} or more fail"
+        )
+    print(text)
     dropped = [r for r in seeing if r.failure == "dropped"]
     print(
         f"{len(dropped)} dropped, {sum(map(is_short, dropped))} of them let go within "
@@ -82,4 +85,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -5,31 +5,34 @@ what weights experts and rows. Fits are not repeated: the rest makes up for a pa
 the mixture does. Without an expert, or with other weights, the forecasts of the whole are mixed
 again. Errors are means of abs dU and dV after the first 69 frames of a track, as in
 ``face-prediction evaluate``; intervals are over people. Every line of ``--out`` is one part on one
-fold: a run that was interrupted goes on where it stopped::
+fold, with the digest of the weights: a run that was interrupted goes on where it stopped, and a
+fold that was fitted again is forecast again::
 
     face-prediction fit --dataset face_dataset --test_fold 0 --out checkpoints/residual_fold0
     python benchmarks/forecast_ablation.py --dataset face_dataset \
         --checkpoints checkpoints/residual_fold* --out ablation.jsonl
 
-prints a Markdown table.
+prints a Markdown table of these checkpoints.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from face_prediction.dataset.reader import FaceDataset
 from face_prediction.dataset.sequences import SequenceSettings
 from face_prediction.dataset.tracks import FaceStretch, dataset_stretches
-from face_prediction.evaluation.tracks import GROUPS, person_resamples
+from face_prediction.evaluation.tracks import TRACK_GROUPS, person_resamples
 from face_prediction.models.loading import load_predictor
 from face_prediction.models.residual import adaptive
 from face_prediction.models.residual.adaptive import HORIZONS
@@ -41,7 +44,12 @@ from face_prediction.models.residual.predictor import (
     face_series,
     face_side,
 )
+from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.documents import convert, parse_json, read_json_lines
+from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import AppendFile, file_digest, locked_file
 
+WEIGHTS = "model.safetensors"
 WHOLE = "nothing"
 MIXING: dict[str, dict[str, float]] = {
     "weights by errors (all experts alike)": {"SHARPNESS": 0.0},
@@ -102,7 +110,7 @@ def sums(stretch: FaceStretch, errors: np.ndarray, settings: SequenceSettings) -
     crops = stretch.crop_sides(settings) / face_side(stretch.landmarks[0])
     size = (np.abs(errors).mean(axis=-1) / crops[:, None])[settings.history - 1 :]
     knots = np.array(HORIZONS)
-    parts = [size[:, (knots >= first) & (knots <= last)] for first, last in GROUPS.values()]
+    parts = [size[:, (knots >= first) & (knots <= last)] for first, last in TRACK_GROUPS.values()]
     return {
         "subject": stretch.subject,
         "kind": stretch.kind,
@@ -136,14 +144,48 @@ def score(
             yield other, [sums(*pair, settings) for pair in pairs]
 
 
-def table(lines: list[dict], resamples: int) -> str:
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Read the lines of ``--out``, if it exists, and remove a last one that was cut off.
+
+    Raises:
+        RequestError: the file cannot be read, or a line is damaged.
+    """
+    if not path.exists():
+        return []
+    lines: list[dict[str, Any]] = []
+    for number, text in read_json_lines(path):
+        source = f"'{path}', line {number}"
+        lines.append(convert(parse_json(text, source), dict, source))
+    os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
+    return lines
+
+
+def load_fit(folder: Path) -> tuple[ResidualFit, dict[str, Any]]:
+    """Load the fit of a fold; return it with what its lines hold: ``fold`` and ``sha256``.
+
+    Raises:
+        RequestError: it is no residual prediction, or no people were left for the report.
+    """
+    predictor, record = load_predictor(folder)
+    if not isinstance(predictor, ResidualPredictor):
+        raise RequestError(f"'{folder}': holds {record.model}; give folders of face-prediction fit")
+    if record.split != "person" or not record.folds["test"]:
+        raise RequestError(f"'{folder}': leaves no fold of people out; fit it with --test_fold")
+    digest = file_digest(folder / WEIGHTS)
+    return predictor.fit, {"fold": record.folds["test"][0], "sha256": digest}
+
+
+def table(lines: list[dict[str, Any]], resamples: int) -> str:
     """Markdown: percent by which the error grows without each part, with 95 % over people."""
-    found: dict = defaultdict(lambda: defaultdict(lambda: np.zeros(len(GROUPS))))
+    found: dict = defaultdict(lambda: defaultdict(lambda: np.zeros(len(TRACK_GROUPS))))
     for line in lines:
         for track in line["tracks"]:
             found[track["kind"]][line["without"], track["subject"]] += np.array(track["sums"])
     shown = [name for name in variants() if any(line["without"] == name for line in lines)]
-    text = ["| kind | without | " + " | ".join(GROUPS) + " |", "|---" * (2 + len(GROUPS)) + "|"]
+    text = [
+        "| kind | without | " + " | ".join(TRACK_GROUPS) + " |",
+        "|---" * (2 + len(TRACK_GROUPS)) + "|",
+    ]
     for kind, by in found.items():
         subjects = sorted({subject for _, subject in by})
         drawn = person_resamples(len(subjects), resamples, 0)
@@ -157,7 +199,7 @@ def table(lines: list[dict], resamples: int) -> str:
                 "–"
                 if not whole[0, g]
                 else f"{percent[0, g]:+.1f} ({low[g]:+.1f} to {high[g]:+.1f})"
-                for g in range(len(GROUPS))
+                for g in range(len(TRACK_GROUPS))
             ]
             text.append(f"| {kind} | {name} | " + " | ".join(cells) + " |")
     return "\n".join(text)
@@ -172,29 +214,31 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("forecast_ablation.jsonl"))
     parser.add_argument("--resamples", type=int, default=1000)
     options = parser.parse_args()
-    lines = []
-    if options.out.exists():
-        lines = [json.loads(line) for line in options.out.read_text().splitlines()]
-    done = {(line["without"], line["fold"], line["most_frames"]) for line in lines}
+    fits = [load_fit(folder) for folder in options.checkpoints]
+    if len({origin["fold"] for _, origin in fits}) < len(fits):
+        raise RequestError("--checkpoints: two leave out the same fold; give one of each fold")
     with FaceDataset(options.dataset) as dataset:
         settings, stretches = dataset.manifest.settings, dataset_stretches(dataset)
-    with options.out.open("a") as out:
-        for folder in options.checkpoints:
-            predictor, record = load_predictor(folder)
-            fold = record.folds["test"][0]
-            names = [n for n in variants() if (n, fold, options.most_frames) not in done]
-            assert isinstance(predictor, ResidualPredictor)
-            own = [
-                replace(stretch, landmarks=stretch.landmarks[: options.most_frames])
-                for stretch in stretches
-                if stretch.fold == fold
-            ]
-            for name, tracks in score(predictor.fit, own, settings, names):
-                head = {"without": name, "fold": fold, "most_frames": options.most_frames}
-                lines.append({**head, "tracks": tracks})
-                print(json.dumps(lines[-1]), file=out, flush=True)
-    print(table([x for x in lines if x["most_frames"] == options.most_frames], options.resamples))
+    chosen: list[dict[str, Any]] = []
+    with locked_file(options.out):
+        lines = read_lines(options.out)
+        with closing(AppendFile(options.out, is_flushed=True)) as out:
+            for fit, origin in fits:
+                head = {**origin, "most_frames": options.most_frames}
+                there = [line for line in lines if head.items() <= line.items()]
+                done = {line["without"] for line in there}
+                own = [
+                    replace(stretch, landmarks=stretch.landmarks[: options.most_frames])
+                    for stretch in stretches
+                    if stretch.fold == origin["fold"]
+                ]
+                names = [name for name in variants() if name not in done]
+                for name, tracks in score(fit, own, settings, names):
+                    there.append({"without": name, **head, "tracks": tracks})
+                    out.append(f"{json.dumps(there[-1])}\n".encode())
+                chosen += there
+    print(table(chosen, options.resamples))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

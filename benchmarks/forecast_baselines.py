@@ -43,6 +43,8 @@ from face_prediction.prediction.errors import (
     normalised_mean_errors,
 )
 from face_prediction.tracking.tracks import load_track
+from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 PERSISTENCE = "persistence"
 FOLDS = 5
@@ -73,7 +75,11 @@ class Scores:
 
 
 def cut_windows(folder: Path, table: Path | None, settings: SequenceSettings) -> Windows:
-    """Every sequence of every track in ``folder``; a clip that is in no table is its own person."""
+    """Every sequence of every track in ``folder``; a clip that is in no table is its own person.
+
+    Raises:
+        RequestError: there is none, or a track or the table cannot be read.
+    """
     rows = read_attributions(table) if table else {}
     kinds = {clip: kind_of(row) for clip, row in rows.items()}
     parts: list[np.ndarray] = []
@@ -94,7 +100,7 @@ def cut_windows(folder: Path, table: Path | None, settings: SequenceSettings) ->
         clips += [path.stem] * len(found)
         starts += found.start.tolist()
     if not parts:
-        raise SystemExit(f"{folder}: no sequence of {settings.length} frames in its tracks")
+        raise RequestError(f"'{folder}': no sequence of {settings.length} frames in its tracks")
     return Windows(
         landmarks=np.stack(parts),
         clips=np.array(clips),
@@ -238,4 +244,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

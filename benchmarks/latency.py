@@ -28,7 +28,7 @@ from robo_manip_baselines.rollout.evaluation import (
 from robo_manip_baselines.rollout.results import Proportion
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import write_json, write_text
+from robo_manip_baselines.runs.files import atomic_file, write_json, write_text
 from robo_manip_baselines.runs.ranges import Episodes, Processes, Seed
 
 EXAMPLE = "python benchmarks/latency.py --checkpoint runs/flow --delays 0 4 8 --num_episodes 100"
@@ -171,7 +171,8 @@ def draw(path: Path, cells: list[Cell]) -> None:
         grid[0].set_ylabel("delay, control steps")
         figure.supxlabel("actions executed of each chunk", fontsize=9)
         figure.colorbar(image, ax=list(grid), label="success, %")
-        figure.savefig(path, dpi=150)
+        with atomic_file(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=150)
 
 
 def main() -> None:

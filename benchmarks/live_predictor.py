@@ -38,10 +38,14 @@ from face_prediction.models.loading import RESIDUAL, SHIPPED, load_predictor
 from face_prediction.models.residual.predictor import ResidualPredictor
 from face_prediction.models.settings import MODELS, PRESETS, make_predictor_model, preset_settings
 from face_prediction.tracking.tracks import NUM_LANDMARKS
+from robo_manip_baselines.runs.command import run_command
+from robo_manip_baselines.runs.errors import RequestError
 
 IMAGE = (640, 480)
 SETTINGS = SequenceSettings()
 PERSISTENCE = "persistence"
+FORECASTERS = [PERSISTENCE, RESIDUAL, *(name for name in MODELS if name != "image_only")]
+"""Predictors of landmarks."""
 
 
 def drawn_faces(count: int) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -155,13 +159,16 @@ def main() -> None:
     parser.add_argument(
         "--models",
         nargs="*",
-        default=[PERSISTENCE, RESIDUAL, *(m for m in MODELS if m != "image_only")],
+        choices=FORECASTERS,
+        default=FORECASTERS,
         help="that forecast landmarks",
     )
     parser.add_argument("--presets", nargs="*", choices=PRESETS, default=["cpu", "paper"])
     parser.add_argument("--frames", type=int, default=60, help="timed, of each")
     parser.add_argument("--threads", type=int, default=2, help="of PyTorch")
     options = parser.parse_args()
+    if min(options.frames, options.threads) < 1:
+        raise RequestError("--frames and --threads must be 1 or more")
     torch.set_num_threads(options.threads)
     print(f"{options.threads} threads, {options.frames} frames, images of {IMAGE[0]}x{IMAGE[1]}.\n")
     print(
@@ -175,4 +182,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

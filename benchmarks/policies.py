@@ -3,7 +3,7 @@
 Trains every policy on each observation and training seed, evaluates it on common seeds, and writes
 ``policies.md``: a table over training seeds, with the differences from the first policy, and one of
 single trainings. A call that was stopped goes on where it was, and calls for some of the policies
-or seeds add to one folder:
+or training seeds add to one folder; other settings need another ``--out``:
 
     python benchmarks/policies.py --dataset dataset/dyskinetic --train_seeds 0 1 --num_episodes 100
 """
@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from robo_manip_baselines.benchmark.statistics.inference import paired_success, rate_estimate
 from robo_manip_baselines.benchmark.statistics.outcomes import (
@@ -28,28 +27,38 @@ from robo_manip_baselines.benchmark.statistics.outcomes import (
     outcome_matrix,
 )
 from robo_manip_baselines.commands.train import parse_config
-from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.policy.presets import ActionExecution, PolicyDims
 from robo_manip_baselines.rollout.evaluation import (
     FIRST_SEED,
     EvaluationConfig,
     evaluate,
 )
-from robo_manip_baselines.rollout.results import Proportion, read_results
+from robo_manip_baselines.rollout.results import MANIFEST, SCHEMA, Proportion, read_results
 from robo_manip_baselines.rollout.rollout import ActingPolicy
 from robo_manip_baselines.runs.command import parse, run_command
-from robo_manip_baselines.runs.documents import convert, parse_json
+from robo_manip_baselines.runs.documents import convert, parse_json, read_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_json, write_text
 from robo_manip_baselines.runs.ranges import Count, Episodes, NonNegativeInt, Processes, Seed
-from robo_manip_baselines.training.batching import BatchLoader
-from robo_manip_baselines.training.config import TrainConfig
-from robo_manip_baselines.training.device import StepTimer
+from robo_manip_baselines.training.config import (
+    CONFIG,
+    TrainConfig,
+    read_config,
+    require_same_config,
+)
 from robo_manip_baselines.training.requirements import prepare_pytorch
-from robo_manip_baselines.training.setup import TrainSetup
-from robo_manip_baselines.training.state import TrainerState
-from robo_manip_baselines.training.step import TrainingStep
-from robo_manip_baselines.training.trainer import train
+
+prepare_pytorch()  # before PyTorch is imported: how its threads wait
+
+import torch  # noqa: E402
+
+from robo_manip_baselines.policy.execution import PolicyRunner  # noqa: E402
+from robo_manip_baselines.training.batching import BatchLoader  # noqa: E402
+from robo_manip_baselines.training.device import StepTimer  # noqa: E402
+from robo_manip_baselines.training.setup import TrainSetup  # noqa: E402
+from robo_manip_baselines.training.state import TrainerState  # noqa: E402
+from robo_manip_baselines.training.step import TrainingStep  # noqa: E402
+from robo_manip_baselines.training.trainer import train  # noqa: E402
 
 EXAMPLE = "python benchmarks/policies.py --dataset dataset/dyskinetic --policies Act Flow"
 
@@ -75,6 +84,9 @@ EPISODES, ROWS = "episodes", "rows"
 TIMED_STEPS = 20
 """Steps of training whose processor time is measured; the median counts."""
 
+TIMED_PREDICTIONS = 50
+"""Predictions whose processor time is measured."""
+
 TIMED_EPISODES = 4
 """Demonstrations that are read to measure times alone."""
 
@@ -92,7 +104,7 @@ class Options:
         delay: Frames by which the mouth is observed late.
         train_seeds: Seeds of the trainings.
         steps: Optimiser steps of each training; those of the preset if not given.
-        num_episodes: Episodes of each evaluation.
+        num_episodes: Episodes of each evaluation; where the folder has more, all of them count.
         seed: Seed of the first episode.
         num_envs: Episodes that run at once; results do not depend on it.
         workers: Processes in which environments step.
@@ -132,6 +144,7 @@ class Row:
         milliseconds: of processor time a prediction and an action, median of many.
         success, strict_success, safe_success: of the episodes.
         episodes: how many.
+        seed: of the first; None in rows of earlier versions, which are measured again.
     """
 
     policy: str
@@ -144,6 +157,7 @@ class Row:
     strict_success: Proportion
     safe_success: Proportion | None
     episodes: Count
+    seed: Seed | None = None
 
     @property
     def name(self) -> str:
@@ -167,20 +181,28 @@ def configure(options: Options, policy: str, observation: str, train_seed: int) 
 
 
 def run(options: Options, policy: str, observation: str, train_seed: int) -> Row:
-    """Train, or continue; evaluate, or continue; and measure; or read what is done."""
+    """Train, or continue; evaluate, or continue; and measure; or read what is done.
+
+    Raises:
+        RequestError: the folder holds a run or episodes of other settings, or something was
+            interrupted.
+    """
     name = run_name(policy, observation, train_seed)
-    file = options.out / ROWS / f"{name}.json"
+    config = configure(options, policy, observation, train_seed)
+    file, episodes = options.out / ROWS / f"{name}.json", options.out / EPISODES / name
+    if file.is_file() or (episodes / MANIFEST).is_file():  # before, more steps extend the training
+        require_same_run(config)
     if file.is_file():
         done = read_row(file)
-        if done.episodes == options.num_episodes:
+        if done.seed == options.seed and done.episodes >= options.num_episodes:
             return done
-    config = configure(options, policy, observation, train_seed)
+    require_same_seed(episodes, options.seed)
     if train(config, resume=True):
         raise RequestError(f"the training of '{name}' was interrupted; call again to continue")
     evaluation = EvaluationConfig(
         checkpoint=config.folder,
         seeds=range(options.seed, options.seed + options.num_episodes),
-        out=options.out / EPISODES / name,
+        out=episodes,
         num_envs=options.num_envs,
         workers=options.workers,
     )
@@ -193,10 +215,44 @@ def run(options: Options, policy: str, observation: str, train_seed: int) -> Row
         time_training(TrainSetup.load(config)),
         time_prediction(plan.make_policy(1), plan.execution, plan.checkpoint.dims),
         *(summary.success, summary.strict_success, summary.success_safe, summary.episodes),
+        seed=options.seed,
     )
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, asdict(row))
     return row
+
+
+def require_same_run(config: TrainConfig[Any]) -> None:
+    """Make sure that a run, if it is there, has these options and these demonstrations.
+
+    Raises:
+        RequestError: naming what differs.
+    """
+    run = config.folder
+    if not (run / CONFIG).is_file():
+        return
+    try:
+        require_same_config(run, config)
+    except RequestError as error:  # this command has no --resume
+        raise RequestError(str(error).replace("--resume extends it, ", "")) from error
+    if read_config(run / CONFIG).get("dataset") != config.to_json()["dataset"]:
+        TrainSetup.load(config).find_start(resume=True)  # compares what the folders hold
+
+
+def require_same_seed(episodes: Path, seed: int) -> None:
+    """Make sure that an evaluation, if it is there, begins with this seed.
+
+    Raises:
+        RequestError: it begins with another.
+    """
+    if not (episodes / MANIFEST).is_file():
+        return
+    first = read_json(episodes / MANIFEST, schema=SCHEMA).get("first_seed", seed)
+    if first != seed:
+        raise RequestError(
+            f"'{episodes}' holds episodes from seed {first} on, not {seed}; choose another --out, "
+            "or give the same --seed"
+        )
 
 
 def read_row(file: Path) -> Row:
@@ -238,7 +294,7 @@ def time_training(setup: TrainSetup) -> float:
 
 
 def time_prediction(
-    policy: ActingPolicy, execution: ActionExecution, dims: PolicyDims, repeats: int = 50
+    policy: ActingPolicy, execution: ActionExecution, dims: PolicyDims
 ) -> tuple[float, float]:
     """Return ms of one thread's processor time: of a prediction, and of the mean action."""
     torch.set_num_threads(1)
@@ -246,7 +302,7 @@ def time_prediction(
     policy.reset(env, [0])
     every = 1 if execution.temporal_ensemble else execution.n_action_steps
     times: list[float] = []
-    for _ in range(repeats * every):
+    for _ in range(TIMED_PREDICTIONS * every):
         begin = time.process_time()
         policy.act(np.zeros((1, dims.state), np.float32), None, env)
         times.append(1e3 * (time.process_time() - begin))
@@ -363,7 +419,6 @@ def _percent(share: Proportion | None) -> str:
 def main() -> None:
     """Run the command."""
     options = parse(Options, EXAMPLE)
-    prepare_pytorch()
     options.out.mkdir(parents=True, exist_ok=True)
     if options.only_times:
         write_text(options.out / TIMES, times_table(options))

@@ -12,7 +12,6 @@ them, the same with shadows and multisampling, and the cameras ``top``, ``angle`
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import platform
 import sys
@@ -21,6 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -32,6 +32,7 @@ from robo_manip_baselines.envs.mujoco.tasks.feeding.env import FeedingEnv
 from robo_manip_baselines.observation import CAMERAS
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import write_json
 
 EXAMPLE = "python benchmarks/render_cameras.py --gym_aloha /tmp/gym-aloha --rounds 50"
 SCENE = Path("gym_aloha", "assets", "bimanual_viperx_transfer_cube.xml")
@@ -177,9 +178,9 @@ def print_table(summary: dict[str, dict[str, float]], options: Options) -> None:
         )
 
 
-def write_json(path: Path, summary: dict[str, dict[str, float]], options: Options) -> None:
-    """Write the figures and what they were measured with."""
-    report = {
+def report(summary: dict[str, dict[str, float]], options: Options) -> dict[str, Any]:
+    """Return the figures and what they were measured with, ready for JSON."""
+    return {
         "height": options.height,
         "width": options.width,
         "rounds": options.rounds,
@@ -187,12 +188,6 @@ def write_json(path: Path, summary: dict[str, dict[str, float]], options: Option
         "cpus": os.cpu_count(),
         "results": summary,
     }
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise RequestError(f"cannot write --json {path}: {error.strerror}") from error
 
 
 def main() -> None:
@@ -209,7 +204,7 @@ def main() -> None:
         summary = summarise(measure(ours | public, options.rounds))
     print_table(summary, options)
     if options.json is not None:
-        write_json(options.json, summary, options)
+        write_json(options.json, report(summary, options))
 
 
 if __name__ == "__main__":

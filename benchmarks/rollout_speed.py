@@ -103,7 +103,7 @@ def measure(
 ) -> float:
     """Return control steps per second."""
     length = -(-steps // num_envs)
-    short = replace(config, env_kwargs={"max_episode_steps": length})
+    short = replace(config, env_kwargs={**config.env_kwargs, "max_episode_steps": length})
     with open_envs(short, num_envs, workers) as envs:
         envs.submit([StepRequest(number, 0, True) for number in range(num_envs)])
         waiting = num_envs

@@ -19,6 +19,7 @@ from robo_manip_baselines.envs.mujoco.cell.vx300s import FINGER_CLOSED, FINGER_O
 from robo_manip_baselines.observation.spec import ARM_JOINTS
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.files import atomic_file
 
 EXAMPLE = "python benchmarks/step_response.py --plot step_response.png"
 ARM = "right"
@@ -32,7 +33,7 @@ class Options:
 
     Attributes:
         step: size of the step, rad.
-        plot: image file to draw the responses to.
+        plot: PNG to draw the responses to.
     """
 
     step: float = 0.3
@@ -139,7 +140,8 @@ def plot(path: Path, responses: dict[str, Response], step: float) -> None:
     figure.supxlabel("time (s)")
     figure.supylabel("fraction of the step")
     figure.tight_layout()
-    figure.savefig(path, dpi=80)
+    with atomic_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=80)
     pyplot.close(figure)
 
 

@@ -29,17 +29,17 @@ import mujoco
 import numpy as np
 
 from robo_manip_baselines.commands.train import parse_config
-from robo_manip_baselines.policy.execution import PolicyRunner
 from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig, EvaluationPlan
 from robo_manip_baselines.rollout.workers import LocalEnvs
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.ranges import Count, Episodes
 from robo_manip_baselines.training.requirements import prepare_pytorch
 
-prepare_pytorch()
+prepare_pytorch()  # before PyTorch is imported: how its threads wait
 
 import torch  # noqa: E402
 
+from robo_manip_baselines.policy.execution import PolicyRunner  # noqa: E402
 from robo_manip_baselines.training.device import PHASES, Processes, StepTimer  # noqa: E402
 from robo_manip_baselines.training.setup import TrainSetup  # noqa: E402
 from robo_manip_baselines.training.step import TrainingStep  # noqa: E402

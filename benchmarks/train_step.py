@@ -14,6 +14,7 @@ Run: ``python benchmarks/train_step.py Act --preset cpu --steps 60``.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import tempfile
 import time
@@ -54,6 +55,8 @@ EPISODES = 10
 EPISODE_STEPS = 120
 WARM_UP = 5
 """Steps before the clock runs: kernels are chosen, memory is taken, threads start."""
+TRANSFERS = 20
+"""Copies of a batch to the device that are timed."""
 
 
 def make_episodes(folder: Path, cameras: tuple[str, ...], size: tuple[int, int]) -> None:
@@ -70,31 +73,34 @@ def make_episodes(folder: Path, cameras: tuple[str, ...], size: tuple[int, int])
         write_episode(path, make_arrays(EPISODE_STEPS, seed), images, make_attributes(seed))
 
 
-def time_transfer(batch: Batch, device: torch.device, repeats: int = 20) -> float:
+def time_transfer(batch: Batch, device: torch.device) -> float:
     """Seconds to copy a batch from page-locked memory."""
     tensors = [getattr(batch, field.name) for field in fields(batch)]
     pinned = [tensor.cpu().pin_memory() for tensor in tensors if tensor is not None]
     torch.cuda.synchronize(device)
     start = time.perf_counter()
-    for _ in range(repeats):
+    for _ in range(TRANSFERS):
         for tensor in pinned:
             tensor.to(device, non_blocking=True)
     torch.cuda.synchronize(device)
-    return (time.perf_counter() - start) / repeats
+    return (time.perf_counter() - start) / TRANSFERS
 
 
 def time_batches(config: TrainConfig[Any], device: torch.device) -> dict[str, float]:
     """Seconds to make a batch, and to copy it to the device."""
     setup = TrainSetup.load(config)
-    images = ImageStore(setup.demonstrations) if setup.dims.cameras else None
-    loader = Trainer(setup, None, device, Processes(), images=images).loader
-    loader.batch(0)
-    start, made = time.perf_counter(), min(setup.total_steps, 10)
-    batches = [loader.batch(step) for step in range(made)]
     on_cuda = device.type == "cuda"
-    if on_cuda:
-        torch.cuda.synchronize(device)
-    making = (time.perf_counter() - start) / made
+    with contextlib.ExitStack() as stack:
+        images = None
+        if setup.dims.cameras:
+            images = stack.enter_context(ImageStore(setup.demonstrations))
+        loader = Trainer(setup, None, device, Processes(), images=images).loader
+        loader.batch(0)
+        start, made = time.perf_counter(), min(setup.total_steps, 10)
+        batches = [loader.batch(step) for step in range(made)]
+        if on_cuda:
+            torch.cuda.synchronize(device)
+        making = (time.perf_counter() - start) / made
     transfer = time_transfer(batches[0], device) if on_cuda else float("nan")
     return {"make a batch": making, "transfer": transfer}
 

@@ -23,7 +23,8 @@ command=(python3 benchmarks/approaches.py --dataset "${DATASET:-face_dataset}" -
   --out "$work/results/approaches" --resamples 500)
 [[ $size == tiny ]] && first=2 && command+=(--preset cpu --batch_size 2 --validate_every 2 --resamples 20)
 
-# train STEPS: of each approach under both splits; a larger number extends what is there.
+# train STEPS: of each approach under both splits; a larger number extends what is there, and what was begun with
+# more steps goes on to those.
 train() {
   local split
   for split in sequence person; do

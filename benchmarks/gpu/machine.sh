@@ -30,8 +30,9 @@ do_step() {
 }
 
 # Everything of a benchmark's folder that is small: tables, report, rows, curves, logs.
+# Each process has a file of its own: the tar of one that was killed goes on writing.
 pack() {
-  local partial="$work/results.partial"
+  local partial="$work/results.$BASHPID.partial"
   tar --create --gzip --file "$partial" --directory "$work" --exclude '*.safetensors' --exclude '*.hdf5' \
     --exclude '*.partial' --exclude tensorboard results 2>/dev/null && mv "$partial" "$out/results.tar.gz"
 }

@@ -53,6 +53,7 @@ if [[ $steps == *paper* ]]; then
   do_step paper "$(($(left) - SAVING - 5))" "${command[@]}"
   kill $monitor $packer 2>/dev/null
   pack
+  rm --force "$work/results.$packer.partial"
   end_sharing
   tail -25 "$out/log.txt"
 fi

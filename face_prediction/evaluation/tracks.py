@@ -45,7 +45,6 @@ TRACK_GROUPS: dict[str, tuple[int, int]] = {
     **{str(h): (h, h) for h in (8, 12, 18, 24)},
 }
 """Frames ahead (from, to) that errors are the mean of: those of sequences, and farther ones."""
-GROUPS = TRACK_GROUPS  # the name that benchmarks/forecast_ablation.py imports
 FAR = list(TRACK_GROUPS).index("3–5")
 """The group that the best baseline is chosen by, as in the paper's protocol."""
 NOMINAL = (0.5, 0.9)

@@ -32,14 +32,17 @@ def approaches(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     def run_train(options: FaceTrainOptions) -> int:
         folder = options.folder
+        config = folder / "config.json"
+        if config.is_file() and read_json(config)["training"]["steps"] == options.steps:
+            return 0  # finished already
         module.trained.append((folder.name, options.steps))
         folder.mkdir(parents=True, exist_ok=True)
         error = 0.02 + abs((options.learning_rate or 0) - 3e-4)
-        config = {
+        record = {
             "training": {"steps": options.steps},
             "validation": {"mouth_error": error, "loss": 1.0},
         }
-        write_json(folder / "config.json", config)
+        write_json(config, record)
         (folder / "model.safetensors").write_text(f"{folder.name} {options.steps}")
         looks = [
             {"kind": "validation", "step": step, "loss": 1.0, "mouth_error": error + 1.0 / step}
@@ -138,6 +141,8 @@ def test_what_is_done_is_not_done_again_and_more_steps_extend_it(
     run(approaches, monkeypatch, tmp_path, *words, "--steps", "200")  # are among those
     assert approaches.evaluated == [evaluation] * 2
     run(approaches, monkeypatch, tmp_path, *words, "--steps", "400")
+    assert approaches.trained == [(name, 200), (name, 400)]
+    run(approaches, monkeypatch, tmp_path, *words, "--steps", "300")  # fewer than it has done
     assert approaches.trained == [(name, 200), (name, 400)]
     assert read_json(tmp_path / "runs" / name / "config.json")["training"]["steps"] == 400
     monkeypatch.setattr(approaches, "run_train", lambda options: 130)

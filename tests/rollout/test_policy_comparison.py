@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from robo_manip_baselines.rollout.results import RESULTS, EpisodeResult, Proportion
+from robo_manip_baselines.rollout.results import (
+    MANIFEST,
+    RESULTS,
+    SCHEMA,
+    EpisodeResult,
+    Proportion,
+)
+from robo_manip_baselines.runs.documents import read_json
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import write_json
+from robo_manip_baselines.training.config import write_config
+
+SEED = {"first_seed": 1000}
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +57,7 @@ def write(policies: ModuleType, out: Path, policy: str, train_seed: int, wins: s
     row = policies.Row(
         *(policy, "default", train_seed, 1000, 60.0 + train_seed, (3.0, 0.5)),
         *(share, share, None, 10),
+        seed=1000,
     )
     (out / "rows").mkdir(parents=True, exist_ok=True)
     write_json(out / "rows" / f"{row.name}.json", asdict(row))
@@ -78,9 +89,42 @@ def test_what_is_done_is_not_done_again(policies: ModuleType, tmp_path: Path) ->
     options = policies.Options(tmp_path / "none", policies=("Mlp",), num_episodes=10, out=tmp_path)
     row = policies.run(options, "Mlp", "default", 3)
     assert (row.success.count, row.parameters, row.milliseconds) == (1, 1000, (3.0, 0.5))
-    more = policies.Options(tmp_path / "none", policies=("Mlp",), num_episodes=20, out=tmp_path)
+    fewer = replace(options, num_episodes=5)
+    assert policies.run(fewer, "Mlp", "default", 3) == row
+    more = replace(options, num_episodes=20)
     with pytest.raises(RequestError, match="none"):  # there are no demonstrations to go on with
         policies.run(more, "Mlp", "default", 3)
+
+
+def test_other_settings_are_refused(policies: ModuleType, tmp_path: Path) -> None:
+    write(policies, tmp_path, "Mlp", 3, {1000})
+    words = {"steps": 100, "num_episodes": 10, "out": tmp_path}
+    options = policies.Options(tmp_path / "none", policies=("Mlp",), **words)
+    config = policies.configure(options, "Mlp", "default", 3)
+    config.folder.mkdir(parents=True)
+    write_config(config.folder, config)
+    write_json(tmp_path / "episodes/mlp_default_seed3" / MANIFEST, SCHEMA.to_json() | SEED)
+    assert policies.run(options, "Mlp", "default", 3).episodes == 10
+    for name, changes in {
+        "holds a run with delay 0, not 2": {"delay": 2},
+        "holds a run with steps 100, not 200; choose another --out": {"steps": 200},
+        "holds episodes from seed 1000 on, not 2000": {"seed": 2000},
+        "other": {"dataset": tmp_path / "other"},  # there are no demonstrations to compare
+    }.items():
+        with pytest.raises(RequestError, match=name):
+            policies.run(replace(options, **changes), "Mlp", "default", 3)
+
+
+def test_rows_of_earlier_versions_are_measured_again(policies: ModuleType, tmp_path: Path) -> None:
+    write(policies, tmp_path, "Mlp", 3, {1000})
+    file = tmp_path / "rows/mlp_default_seed3.json"
+    row = read_json(file)
+    del row["seed"]
+    write_json(file, row)
+    options = policies.Options(tmp_path / "none", policies=("Mlp",), num_episodes=10, out=tmp_path)
+    with pytest.raises(RequestError, match="none"):  # there are no demonstrations
+        policies.run(options, "Mlp", "default", 3)
+    assert "| Mlp | default | 3 | 10 |" in policies.page(tmp_path)
 
 
 def test_unknown_names_are_refused(policies: ModuleType, tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def read_video(path: Path, row: ResultRow) -> EpisodeVideo:
         RequestError: there is none, or it cannot be played.
     """
     # Imported here: they load the simulator.
-    import av
+    import av.error
     import cv2
 
     from robo_manip_baselines.rollout.videos import VideoWriter
