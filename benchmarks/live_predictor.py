@@ -4,7 +4,7 @@ Wall-clock time, and beside it processor time, summed over threads, which other 
 machine hardly touch. Networks have random weights: a trained one takes as long. Each is fed a face
 that moves in drawn images; the history is whole and the crop holds, as it does most of the time.
 ``residual`` is the one that ships.
-Beside it, the same network encodes its whole history anew in every frame, and makes its pictures.
+Beside it, the same network encodes its whole history again in every frame, and makes its pictures.
 Prints a Markdown table::
 
     python benchmarks/live_predictor.py --threads 2

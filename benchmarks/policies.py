@@ -312,7 +312,7 @@ def time_prediction(
 def times_table(options: Options) -> str:
     """Measure processor times without any training; return a Markdown table."""
     lines = [
-        "| policy | shown | weights | steps | a step of training, ms | training, s "
+        "| policy | observation | weights | steps | a step of training, ms | training, s "
         "| a prediction, ms | an action, ms |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -339,7 +339,7 @@ def times_table(options: Options) -> str:
 def trainings_table(rows: Sequence[Row]) -> str:
     """Return a Markdown table, a row for each training."""
     lines = [
-        "| policy | shown | training seed | episodes | success, % | strict success, % "
+        "| policy | observation | training seed | episodes | success, % | strict success, % "
         "| safe success, % |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -359,7 +359,7 @@ def policies_table(rows: Sequence[Row], outcomes: dict[str, OutcomeMatrix]) -> s
             seeds that both have.
     """
     lines = [
-        "| policy | shown | trainings | episodes of each | success, % | strict success, % "
+        "| policy | observation | trainings | episodes of each | success, % | strict success, % "
         "| safe success, % | success less that of the first, points | p | weights "
         "| training, s | a prediction, ms | an action, ms |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",

@@ -57,7 +57,7 @@ class BuildDatasetOptions:
         out: Folder for the dataset.
         attribution: Table (.csv, or Markdown) with the columns clip, subject, ship, licence,
             source, and optionally kind (natural, head_motion or grid) and what. Clips without kind
-            and what are told by how far the head turns.
+            and what are classified by how far the head turns.
         same_person: Subjects of the table that are one person, as NAME=OTHER: NAME becomes OTHER.
         settings: Settings of the sequences.
         folds: Parts that people are divided into; 1: nobody is trained on, all are reported on.

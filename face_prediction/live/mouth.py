@@ -203,7 +203,7 @@ class LipMemory:
         return points
 
     def _averaged(self, turn: Floats, time: float) -> Floats:
-        """Mean of the turns so far, the later ones weighing more; anew after a gap."""
+        """Mean of the turns so far, the later ones weighing more; afresh after a gap."""
         import cv2
 
         gap, self._seen = time - self._seen, time
@@ -316,7 +316,7 @@ class MouthTracker:
         return distance + self._lips
 
     def _smoothed(self, distance: float, time: float) -> float:
-        """Mean of the distances so far, the later ones weighing more; anew after a gap."""
+        """Mean of the distances so far, the later ones weighing more; afresh after a gap."""
         gap = time - self._seen
         if self._distance is None or gap > MAX_GAP:
             self._distance, self._count = distance, 0

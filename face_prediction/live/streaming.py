@@ -202,7 +202,7 @@ class StreamingPredictor:
         self._frames: deque[_Frame] = deque()
         self._crop: Crop | None = None
         self._follower: FaceFollower | None = None
-        self._followed = 0.0  # s, until when the follower has been told
+        self._followed = 0.0  # s, until when the follower is up to date
 
     def update(
         self, time: float, landmarks: NDArray[np.floating] | None, image: NDArray[np.uint8]

@@ -212,7 +212,7 @@ class VideoReader:
         if tracker.lost and self._container.format.name in _TIMELESS:
             wrong = f"{tracker.lost} of its {packets} frames cannot be decoded"
             raise self._wrong(
-                f"{wrong}, and without times the others have no place; record it anew"
+                f"{wrong}, and without times the others have no place; record it again"
             )
 
     def _time(self, frame: av.VideoFrame, number: int) -> float | None:

@@ -95,7 +95,7 @@ def frame_persistence(stats: ErrorStats, gain: Floats) -> Floats:
 def empirical(stats: ErrorStats) -> Draw:
     """Play measured errors again, in blocks of ``BLOCK_FRAMES`` from anywhere (block bootstrap).
 
-    A block that comes to the end of a run goes on at its beginning, so that every measured error is
+    A block that reaches the end of a run goes on at its beginning, so that every measured error is
     as likely as any other. Between forecasts that are ``stride`` frames apart it is interpolated,
     and the deviation from the mean scaled so that the variance is the same at every frame.
 

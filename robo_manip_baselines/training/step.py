@@ -39,7 +39,7 @@ class TrainingStep:
         state: network and optimiser.
         autocast: type of the products, None for fp32.
         clip_norm: largest norm of the gradient; 0 for no clipping.
-        timer: told the end of each phase.
+        timer: marks the end of each phase.
         is_recorded: replay the step from a CUDA graph.
     """
 

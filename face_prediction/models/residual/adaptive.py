@@ -76,7 +76,7 @@ PRIOR_ROWS = 20.0
 PACE_MEMORY = 60.0
 """Frames after which a step counts 1 / e in the pace."""
 MOST_PACE = 6.0
-"""Times that a pace is beyond the median one, or below it, at most, where errors are told by it."""
+"""Times that a pace is beyond the median one, or below it, at most, where it predicts errors."""
 LEAST_PACE = 1e-4
 """Face sides a frame: below the detector's jitter."""
 
@@ -134,7 +134,7 @@ class StateForecast:
 
     Attributes:
         moved: (N, H, D).
-        signs: (N, H, S) logarithms from which the size of the mouth's error is told, see
+        signs: (N, H, S) logarithms from which the size of the mouth's error is estimated, see
             `intervals`.
         experts: (N, E, H, D) forecasts of every expert.
         features: (N, F) scaled, of every expert.
@@ -466,7 +466,7 @@ class _Learner:
 
 
 LATE_MEMORY = 8.0
-"""Frames after which an error counts 1 / e among the late ones, from which intervals are told."""
+"""Frames after which an error counts 1 / e among the late ones, which intervals follow."""
 
 
 def overlap(horizon: ArrayLike) -> Floats:

@@ -3,7 +3,7 @@
 A face is a series of D = 2 + K numbers a frame: the mouth centre (u, v) and the coefficients of K
 principal shapes of all landmarks. An expert forecasts its displacements 1 ... H frames ahead from
 the last displacements, and from the place of the face relative to slow means of it. A moving face
-comes back: what lies a second ahead is told by the place more than by the last step.
+comes back: the place predicts what lies a second ahead better than the last step.
 
 Shapes: N faces or rows, W recent frames, M slow means, D series, F features, H horizons.
 """

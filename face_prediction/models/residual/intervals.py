@@ -1,7 +1,7 @@
 """Intervals of residual prediction: the size of the next error, and how often it is exceeded.
 
-The size of the mouth's error is told from four logarithms (`StateForecast.signs`): the errors on
-this face so far, those of the last frames, the speed now, and how far the experts are apart. The
+The size of the mouth's error is estimated from four logarithms (`StateForecast.signs`): the errors
+on this face so far, those of the last frames, the speed now, and how far the experts are apart. The
 ratio of an error to that size has quantiles, which are measured on people that the coefficients
 were not fitted to, and then move with each outcome on the watched face, so that the share that is
 exceeded becomes what was promised (adaptive conformal inference: Gibbs and Candes 2021; the
@@ -98,7 +98,7 @@ class IntervalTracker:
         self._quantiles[:, known] += rates * (exceeds - (1 - np.array(LEVELS)))
 
     def remember(self, signs: Floats) -> None:
-        """Keep the sizes told with a forecast, to learn from its outcome."""
+        """Keep the sizes estimated with a forecast, to learn from its outcome."""
         self._past.push(self.fit.log_sizes(signs))
 
     def student_t(self, signs: Floats) -> tuple[Floats, Floats]:

@@ -65,7 +65,7 @@ class FrozenBatchNorm(nn.Module):
 def for_products(x: Tensor) -> Tensor:
     """Return a tensor in the type of autocast's products, where there is autocast.
 
-    What several layers read is so cast once.
+    What several layers read is thus cast once.
     """
     kind = x.device.type
     if kind in ("cpu", "cuda") and torch.is_autocast_enabled(kind):

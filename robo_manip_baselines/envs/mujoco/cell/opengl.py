@@ -136,7 +136,8 @@ def _probe(backend: str) -> tuple[str, str | None]:
 def explain_failure(backend: str, reason: str) -> str:
     """Return one line with the cause of a failure to render and what to do.
 
-    A wrong environment variable is told from a missing library, which alone is to be installed.
+    A wrong environment variable is distinguished from a missing library, which alone is to be
+    installed.
 
     Args:
         backend: key of ``APT_PACKAGES``.

@@ -80,7 +80,7 @@ class ExpertPhase(Protocol):
     """A stretch of an expert's work."""
 
     def start(self, view: ExpertView, last: Command) -> None:
-        """Begin, the gripper having been told to be at ``last``."""
+        """Begin, the gripper having been commanded to ``last``."""
         ...
 
     def step(self, view: ExpertView) -> Command:

@@ -85,7 +85,7 @@ class Execution(Protocol):
 
 
 def first_of(plan: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Execute the first step of each plan, so that every step is planned anew."""
+    """Execute the first step of each plan, so that every step has a plan of its own."""
     return plan[0]
 
 

@@ -62,8 +62,8 @@ class MotionSegment:
         subject: id of the person.
         start: first frame, counted from the start of the run.
         index: the same frame, counted from the start of the library.
-        predicted: (M, H, 3) m, world axes, where a trained predictor said in each frame that the
-            mouth would be 1 ... H frames later, as a displacement; None in a library without.
+        predicted: (M, H, 3) m, world axes, the mouth 1 ... H frames later as a trained
+            predictor forecast it in each frame, as a displacement; None in a library without.
     """
 
     fps: float
@@ -128,8 +128,8 @@ class MotionLibrary:
         run_clip, run_subject: (R,) ids.
         metadata: attribution, camera model, and what was left out.
         source: the file it came from.
-        predicted: (N, H, 3) m, where a trained predictor said in each frame that the mouth would
-            be 1 ... H frames later; None if the library has no predictions.
+        predicted: (N, H, 3) m, the mouth 1 ... H frames later as a trained predictor forecast it in
+            each frame; None if the library has no predictions.
         people: whose runs it holds: ``all``, or those of one `part`.
     """
 

@@ -243,7 +243,7 @@ class TaskEntry:
         goal_env: ``module:class`` of a goal-conditioned view of it, for reinforcement learning;
             empty without one. Commands do not take it.
         schema_version: lowest version of the episode schema that describes its files.
-        instruction: the task in words, as policies with language are told it.
+        instruction: the task in words, for policies with language.
     """
 
     name: str

@@ -34,7 +34,7 @@ from robo_manip_baselines.envs.mujoco.tasks.feeding.expert import (
 MEETING = np.array([-0.19, 0.12, 0.27])
 """m, world: where the cube is handed over, beside the person and above the right shoulder. Lower or
 nearer, the right gripper, 0.15 m across, brushes the shoulder of a person who leans towards it;
-further away, the left wrist comes to its limit."""
+further away, the left wrist reaches its limit."""
 
 HOLD_DEPTH = 0.02
 """m from the site of the left gripper, which points down, to the cube's centre: its fingers hold

@@ -28,7 +28,7 @@ PAPER_HORIZONS = range(1, 6)
 """Frames of 1/30 s, Tables IV and V."""
 
 LITTLE = 0.10
-"""Rate that errors may cost and still be said to cost little. The paper's own cost 0.05."""
+"""Largest cost of errors, as a rate, that counts as little. The paper's own cost 0.05."""
 
 _LITTLE = f"(less than {100 * LITTLE:.0f} points)"
 
@@ -100,7 +100,7 @@ def draw_arrivals(axes: Any, results: Sequence[Mapping[str, Any]], many: bool) -
     Args:
         axes: of Matplotlib, in mm; the person's left is on the right.
         results: columns of the result rows of one condition, with ``is_success``.
-        many: whether there are so many points that they are drawn as pixels.
+        many: whether the points are many, and drawn as pixels.
     """
     across, up = 1000.0 * MOUTH_TOLERANCE[1:]
     view = 1000.0 * FACE_VIEW
