@@ -335,8 +335,8 @@ class RowStore:
         self._bytes = bytearray()
 
     def append(self, rows: np.ndarray) -> None:
-        """Append rows (T, *shape), converted to the type of the store."""
-        self._bytes += np.ascontiguousarray(rows, dtype=self._dtype).data.cast("B")
+        """Append rows (T, *shape), perhaps none, converted to the type of the store."""
+        self._bytes += np.ascontiguousarray(rows, dtype=self._dtype).reshape(-1).view(np.uint8).data
 
     def array(self) -> np.ndarray:
         """All rows, without a copy; nothing may be appended afterwards."""
