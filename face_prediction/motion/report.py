@@ -340,6 +340,9 @@ def euler_angles(orientation: np.ndarray) -> np.ndarray:
 
 
 def _draw_position(axes: Any, seconds: np.ndarray, motion: ClipMotion) -> None:
+    axes.set_ylabel("mouth from first kept, mm")
+    if not motion.quality.found.any():
+        return
     first = motion.runs[0][0] if motion.runs else int(np.argmax(motion.quality.found))
     origin = motion.mouth[first]
     if motion.depth_smoothed:
@@ -361,7 +364,6 @@ def _draw_position(axes: Any, seconds: np.ndarray, motion: ClipMotion) -> None:
         low, high = min(low, kept.min()), max(high, kept.max())
     margin = 0.08 * (high - low) + 1
     axes.set_ylim(low - margin, high + margin)
-    axes.set_ylabel("mouth from first kept, mm")
     axes.legend(loc="upper right", ncols=4, fontsize="small")
 
 
