@@ -7,8 +7,10 @@ import hashlib
 import logging
 import subprocess
 import sys
+import threading
 import weakref
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -405,6 +407,23 @@ class TestModelFile:
         with pytest.raises(RequestError, match=r"fetch file:.*--detector_model") as caught:
             find_model(None, nowhere, "0")
         assert "\n" not in str(caught.value)
+
+    def test_a_download_that_breaks_off_is_not_kept(self, cache: Path) -> None:
+        class HalfAModel(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:  # noqa: N802 - called by name
+                self.send_response(200)
+                self.send_header("Content-Length", "1000")
+                self.end_headers()
+                self.wfile.write(b"half a mod")
+
+            def log_message(self, *_: object) -> None: ...
+
+        with HTTPServer(("127.0.0.1", 0), HalfAModel) as server:
+            threading.Thread(target=server.handle_request, daemon=True).start()
+            address = f"http://127.0.0.1:{server.server_port}/model.task"
+            with pytest.raises(RequestError, match=r"none could be downloaded \(IncompleteRead"):
+                find_model(None, address, "0" * 64)
+        assert not cache.exists()
 
     def test_the_option_of_the_command_is_named(self, tmp_path: Path) -> None:
         nowhere = (tmp_path / "nothing").as_uri()
