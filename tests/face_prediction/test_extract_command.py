@@ -28,7 +28,7 @@ from face_prediction.tracking.detector import (
     default_model_path,
     find_model,
 )
-from face_prediction.tracking.tracks import load_track, save_track
+from face_prediction.tracking.tracks import TRACK_FILE, load_track, save_track
 from face_prediction.tracking.video import VideoReader
 from robo_manip_baselines.runs.errors import RequestError, WriteError
 
@@ -260,6 +260,21 @@ def test_few_frames_and_faces_are_held(tmp_path, write_video, run, monkeypatch) 
     assert len(load_track(tmp_path / "tracks" / "ann.npz")) == 120
     assert most["images"] <= 3
     assert most["faces"] <= 8 + 3  # the chunk, the newest, and the one that is followed
+
+
+@pytest.mark.parametrize(("limit", "arguments"), [("T", ()), ("T", ("--fps", "None")), ("S", ())])
+def test_a_track_that_could_not_be_read_back_is_not_made(
+    tmp_path: Path, write_video, run, monkeypatch, caplog, limit: str, arguments: tuple[str, ...]
+) -> None:
+    video = write_video(tmp_path / "ann.mp4", [picture(20)] * 30)
+    monkeypatch.setitem(TRACK_FILE.limits, limit, 30)
+    assert run(video, *arguments) == 0
+    (tmp_path / "tracks" / "ann.npz").unlink()
+    monkeypatch.setitem(TRACK_FILE.limits, limit, 20)
+    assert run(video, *arguments) == 2
+    assert "decoded ones at most; cut the video, or give a lower --fps" in caplog.text
+    assert StandIn.looked < 60
+    assert not any((tmp_path / "tracks").iterdir())
 
 
 def test_a_killed_run_leaves_whole_files_and_carries_on(
