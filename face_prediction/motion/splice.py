@@ -41,8 +41,8 @@ class SpliceSettings:
         min_stretch: Seconds of the shortest stretch that is used.
         max_turn: Degrees between two heads that are blended, on average.
         max_gap: Metres between two mouths that are blended, on average.
-        max_spliced: Seconds of spliced motion of one person, at most; by default so many that
-            nobody makes up more than a fifth of the library that ships.
+        max_spliced: Seconds of spliced motion of one person after which no stretch is added; by
+            default so many that nobody makes up more than a fifth of the library that ships.
     """
 
     splice: bool = False
