@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from face_prediction.motion import report
 from face_prediction.motion.library import load_motion, save_motion
 from face_prediction.motion.report import BEGIN, END
 from face_prediction.tracking.tracks import save_track
@@ -111,6 +114,26 @@ def test_the_report(folder: Path, run) -> None:
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert picture.stat().st_size < 80_000
         assert f"(images/motion_{clip}.png)" in text
+
+
+def test_a_report_that_was_killed_is_written_again(folder: Path, run, monkeypatch) -> None:
+    page = folder / "page.md"
+    arguments = ("--attribution", folder / "clips.csv", "--report", page)
+    write = report.atomic_file
+
+    @contextmanager
+    def killed(path: Path) -> Iterator[Path]:
+        if path.name == "motion_steady.png":
+            raise KeyboardInterrupt
+        with write(path) as temporary:
+            yield temporary
+
+    with monkeypatch.context() as patch:
+        patch.setattr(report, "atomic_file", killed)
+        assert run(*arguments) == 130
+    assert [path.name for path in (folder / "images").iterdir()] == ["motion_lively.png"]
+    assert run(*arguments) == 0
+    assert len(list((folder / "images").iterdir())) == 2
 
 
 @pytest.mark.parametrize(
