@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -252,12 +253,18 @@ def write_splice_report(
 def _rewrite(path: Path, text: str, plots: Mapping[str, bytes], marks: tuple[str, str]) -> None:
     """Put Markdown and plots, by the names of their clips, between the marks of a page.
 
-    The page is written first: a plot that no page shows would be in the way of the next report.
+    Plots that it will no longer show are removed, and the page is written before the others: a plot
+    that no page shows would be in the way of the next report.
     """
     begin, end = marks
     before, rest = read_page(path, marks).split(begin)
+    ours, after = rest.split(end)
     shown = [f"![Motion of {name}]({IMAGES}/{plot_path(path, name).name})" for name in plots]
-    write_text(path, before + "\n\n".join([begin, text, *shown, end]) + rest.split(end)[1])
+    page = before + "\n\n".join([begin, text, *shown, end]) + after
+    for link in set(re.findall(rf"\]\({IMAGES}/motion_[^/\n]+?\.png\)", ours)):
+        if link not in page:
+            (path.parent / link[2:-1]).unlink(missing_ok=True)
+    write_text(path, page)
     for name, plot in plots.items():
         with atomic_file(plot_path(path, name)) as temporary:
             temporary.write_bytes(plot)
