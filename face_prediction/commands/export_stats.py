@@ -165,8 +165,8 @@ def library_residuals(dataset: FaceDataset, path: Path, kind: str) -> tuple[Mout
         through each clip's runs, one apart within a run and further between runs.
 
     Raises:
-        RequestError: the library holds no forecasts, or none of this kind, or an unknown clip, or is
-            at another rate than the dataset.
+        RequestError: the library holds no forecasts, or none of this kind, or an unknown clip, or
+            is at another rate than the dataset.
     """
     library = load_motion(path)
     record = library.metadata.get("prediction")
@@ -175,8 +175,8 @@ def library_residuals(dataset: FaceDataset, path: Path, kind: str) -> tuple[Mout
     fps = dataset.manifest.settings.fps
     if not math.isclose(library.fps, fps, rel_tol=1e-6):
         raise RequestError(
-            f"--library {path}: is at {library.fps:g} frames a second, {dataset.folder} at {fps:g}; "
-            "give the dataset that it was forecast with"
+            f"--library {path}: is at {library.fps:g} frames a second, {dataset.folder} at "
+            f"{fps:g}; give the dataset that it was forecast with"
         )
     kinds = {clip.clip: clip.kind for clip in dataset.manifest.clips if clip.sequences}
     horizon = library.predicted_mouth.shape[1]

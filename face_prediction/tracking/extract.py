@@ -486,8 +486,8 @@ def require_room(path: Path, frames: int, seconds: float, fps: float | None) -> 
     most = TRACK_FILE.limits
     if made > most["T"] or frames > most["S"]:
         raise RequestError(
-            f"{path}: a track holds {most['T']} frames of {most['S']} decoded ones at most; cut the "
-            "video, or give a lower --fps"
+            f"{path}: a track holds {most['T']} frames of {most['S']} decoded ones at most; cut "
+            "the video, or give a lower --fps"
         )
 
 

@@ -427,7 +427,7 @@ class TestModelFile:
 
     def test_a_download_that_breaks_off_is_not_kept(self, cache: Path) -> None:
         class HalfAModel(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:  # noqa: N802 - called by name
+            def do_GET(self) -> None:
                 self.send_response(200)
                 self.send_header("Content-Length", "1000")
                 self.end_headers()

@@ -136,9 +136,7 @@ def test_a_report_that_was_killed_is_written_again(folder: Path, run, monkeypatc
     assert len(list((folder / "images").iterdir())) == 2
 
 
-def test_a_plot_that_a_report_no_longer_shows_is_removed(
-    folder: Path, make_track, run
-) -> None:
+def test_a_plot_that_a_report_no_longer_shows_is_removed(folder: Path, make_track, run) -> None:
     save_track(folder / "tracks" / "steady.npz", make_track(sway(60, 0.0), name="steady.mp4"))
     arguments = ("--attribution", folder / "clips.csv", "--report", folder / "page.md")
     for min_run, plots in ((1, {"steady", "lively"}), (3, {"lively"}), (3, {"lively"})):
