@@ -70,6 +70,6 @@ wheelhouse: ## all wheels for a machine without network: make wheelhouse PYTHON=
 	@.ci/setup
 	$(BIN)/python .ci/wheelhouse.py --python "$(or $(PYTHON),3.12)" $(if $(filter 1,$(WITH_TORCH)),--with_torch)
 
-clean: ## remove what the other targets made, datasets excepted
+clean: ## remove what the other targets made, datasets and results excepted
 	rm -rf .venv wheelhouse build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 if TYPE_CHECKING:  # the package is an extra
     from mkdocs.config.defaults import MkDocsConfig
@@ -47,8 +47,6 @@ API_MODULES = {
 
 SEARCH_SHIM = "https://unpkg.com/iframe-worker/shim"
 """Address from which Material's plugin ``offline`` would load it."""
-
-DATASET_COMMANDS = ("info", "verify", "plot", "view", "merge", "split", "compare", "tile")
 
 os.environ["COLUMNS"] = "80"  # of the pages of help
 
@@ -154,9 +152,11 @@ def api_page() -> str:
 def commands_page() -> str:
     """Return the ``--help`` of every command, which its options' dataclass generates."""
     from face_prediction.commands.cli import COMMANDS as FACE_COMMANDS
+    from robo_manip_baselines.commands.dataset import COMMANDS as DATASET_COMMANDS
     from robo_manip_baselines.policy.registry import policy_names
 
-    subcommands = {"Train": policy_names(), "Dataset": DATASET_COMMANDS, "Benchmark": ["foresight"]}
+    dataset_names = [command.__name__.lower() for command in get_args(DATASET_COMMANDS)]
+    subcommands = {"Train": policy_names(), "Dataset": dataset_names, "Benchmark": ["foresight"]}
     pages = ["# Commands\n\nGenerated from the options of the commands themselves.\n"]
     for script in sorted((ROOT / "bin").glob("*.py")):
         main = import_module(f"robo_manip_baselines.commands.{script.stem.lower()}").main

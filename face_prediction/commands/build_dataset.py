@@ -36,7 +36,12 @@ from face_prediction.dataset.sequences import SequenceSettings, kind_of
 from face_prediction.motion.attribution import Attribution, find_row, read_attributions
 from face_prediction.motion.library import track_files
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import FolderKind, locked, require_out_folder
+from robo_manip_baselines.runs.files import (
+    FolderKind,
+    locked,
+    remove_temporaries,
+    require_out_folder,
+)
 from robo_manip_baselines.runs.ranges import Seed
 
 logger = logging.getLogger(__name__)
@@ -89,6 +94,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> int:
     require_fold_options(options.folds, options.seed)
     require_out_folder(options.out, DATASET, [*options.tracks, *options.videos])
     with locked(options.out, is_kept=False):
+        remove_temporaries(options.out, options.out / CLIP_FOLDER)
         return _build_dataset(options)
 
 
@@ -159,10 +165,11 @@ def with_one_name(
 
     Args:
         rows: by clip.
-        same_person: NAME=OTHER each.
+        same_person: NAME=OTHER each; of A=B and B=C, all three are one person.
 
     Raises:
-        RequestError: one is of another form, or there is nobody of that name.
+        RequestError: one is of another form, there is nobody of that name, or a name is to become
+            two others or, in the end, itself.
     """
     names = {row.subject for row in rows.values()}
     other: dict[str, str] = {}
@@ -170,11 +177,23 @@ def with_one_name(
         name, equals, same = pair.partition("=")
         if not (name and equals and same):
             raise RequestError(f"--same_person {pair}: no pair of names; valid: NAME=OTHER")
-        other[require_choice("subject of --same_person", name, names)] = same
-    return {
-        clip: replace(row, subject=other.get(row.subject, row.subject))
-        for clip, row in rows.items()
-    }
+        require_choice("subject of --same_person", name, names)
+        if other.setdefault(name, same) != same:
+            raise RequestError(
+                f"--same_person {name}={other[name]} {pair}: '{name}' becomes two; name one, and "
+                f"say {other[name]}={same} if these are one person, too"
+            )
+
+    def last(name: str) -> str:
+        passed = [name]
+        while passed[-1] in other:
+            passed.append(other[passed[-1]])
+            if passed[-1] in passed[:-1]:
+                circle = ", ".join(passed)
+                raise RequestError(f"--same_person: goes in a circle ({circle}); leave one out")
+        return passed[-1]
+
+    return {clip: replace(row, subject=last(row.subject)) for clip, row in rows.items()}
 
 
 def refuse_same_video(entries: Iterable[ClipEntry]) -> None:

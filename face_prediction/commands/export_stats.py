@@ -165,11 +165,19 @@ def library_residuals(dataset: FaceDataset, path: Path, kind: str) -> tuple[Mout
         through each clip's runs, one apart within a run and further between runs.
 
     Raises:
-        RequestError: the library holds no forecasts, or none of this kind, or an unknown clip.
+        RequestError: the library holds no forecasts, or none of this kind, or an unknown clip, or
+            is at another rate than the dataset.
     """
     library = load_motion(path)
-    if library.predicted_mouth is None:
+    record = library.metadata.get("prediction")
+    if library.predicted_mouth is None or not isinstance(record, dict):
         raise RequestError("--library: holds no forecasts; make it with face-prediction predict")
+    fps = dataset.manifest.settings.fps
+    if not math.isclose(library.fps, fps, rel_tol=1e-6):
+        raise RequestError(
+            f"--library {path}: is at {library.fps:g} frames a second, {dataset.folder} at "
+            f"{fps:g}; give the dataset that it was forecast with"
+        )
     kinds = {clip.clip: clip.kind for clip in dataset.manifest.clips if clip.sequences}
     horizon = library.predicted_mouth.shape[1]
     metres: list[NDArray[np.float64]] = []
@@ -194,7 +202,7 @@ def library_residuals(dataset: FaceDataset, path: Path, kind: str) -> tuple[Mout
         raise RequestError(f"--library {path}: has no run of kind '{kind}'")
     values = np.concatenate(metres)
     span = median_crop_span(dataset, clips)
-    predictor = str(library.metadata["prediction"]["predictor"])
+    predictor = str(record.get("predictor", "unknown"))
     found = MouthResiduals(values / span, clips, subjects, starts, 1, predictor, data_hash(values))
     return found, span
 

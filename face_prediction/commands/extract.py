@@ -20,6 +20,7 @@ from robo_manip_baselines.runs.files import (
     FileKind,
     file_digest,
     locked_file,
+    remove_temporaries,
     require_out_file,
     require_out_folder,
 )
@@ -65,6 +66,7 @@ def run_extract(options: ExtractOptions) -> int:
     """
     outputs = output_paths(options.videos, options.out)
     model = find_model(options.detector_model)
+    remove_temporaries(options.out)
     made = kept = 0
     refused: list[str] = []
     failed: list[str] = []

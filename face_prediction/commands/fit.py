@@ -16,7 +16,12 @@ from face_prediction.dataset.split import NO_PART_LEFT, SplitName, split_dataset
 from face_prediction.dataset.tracks import FaceStretch, dataset_stretches, without_windows
 from face_prediction.evaluation.predictors import UNFITTED, dataset_landmarks
 from face_prediction.forecast import FORECASTERS, fit_forecaster
-from face_prediction.models.loading import RESIDUAL, save_residual
+from face_prediction.models.loading import (
+    BASELINES_FILE,
+    RESIDUAL,
+    holds_residual,
+    save_residual,
+)
 from face_prediction.models.residual.experts import EXPERTS
 from robo_manip_baselines.runs.documents import read_json
 from robo_manip_baselines.runs.errors import RequestError
@@ -31,6 +36,9 @@ from robo_manip_baselines.runs.ranges import NonNegativeInt
 from robo_manip_baselines.runs.versions import software_versions
 
 logger = logging.getLogger(__name__)
+
+ATTRIBUTION_FILE = "attribution.csv"
+_ATTRIBUTION_COLUMNS = ("clip", "subject", "licence", "source")
 
 MOST_FRAMES = 2000
 """Frames of one person that are fitted to: a minute. More would make the fit that person's."""
@@ -119,8 +127,8 @@ def _fit(dataset: FaceDataset, options: FitOptions, out: Path) -> int:
         split=split.by,
         windows_sha256=split.windows_sha256,
     )
+    write_text(out / ATTRIBUTION_FILE, attribution_csv(used, set(record.train_subjects)))
     save_residual(out, record, fit, baselines)
-    write_text(out / "attribution.csv", attribution_csv(used, set(record.train_subjects)))
     logger.info("%s: residual, fitted to %d people", out, len(record.train_subjects))
     return 0
 
@@ -141,7 +149,7 @@ def attribution_csv(clips: Sequence[ClipEntry], subjects: set[str]) -> str:
     """The clips that were fitted to, with licence and source, as CSV."""
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
-    table.writerow(["clip", "subject", "licence", "source"])
+    table.writerow(_ATTRIBUTION_COLUMNS)
     for clip in clips:
         if clip.subject in subjects and clip.sequences:
             table.writerow([clip.video, clip.subject, clip.licence, clip.source])
@@ -153,4 +161,12 @@ def _is_fitted(folder: Path) -> bool:
     return path.exists() and read_json(path).get("model") == RESIDUAL
 
 
-WEIGHTS = FolderKind("weights of face-prediction fit", _is_fitted)
+def _is_begun(path: Path) -> bool:
+    """Return whether a file is one that `fit` writes before ``config.json``, which is the last."""
+    if path.name == ATTRIBUTION_FILE:
+        start = ",".join(_ATTRIBUTION_COLUMNS).encode()
+        return path.is_file() and path.read_bytes().startswith(start)
+    return path.name in (BASELINES_FILE, "model.safetensors") and holds_residual(path)
+
+
+WEIGHTS = FolderKind("weights of face-prediction fit", _is_fitted, begun=_is_begun)

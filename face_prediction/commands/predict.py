@@ -302,8 +302,14 @@ def longest_horizon(predictor: Predictor) -> int:
     return int(getattr(predictor, "horizon", HORIZON))
 
 
-def errors_by_clip(library: RecordedMotion) -> dict[str, dict[str, list[float]]]:
-    """Mean distance across the view in mm by frame ahead, of the forecasts and of persistence."""
+Means = list[float | None]
+
+
+def errors_by_clip(library: RecordedMotion) -> dict[str, dict[str, Means]]:
+    """Mean distance across the view in mm by frame ahead, of the forecasts and of persistence.
+
+    None where no run of a clip lasts so many frames.
+    """
     assert library.predicted_mouth is not None
     pooled: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
     for index, name in enumerate(library.run_clip.tolist()):
@@ -314,20 +320,24 @@ def errors_by_clip(library: RecordedMotion) -> dict[str, dict[str, list[float]]]
         pair = (errors_across(ahead, mouth), errors_across(still, mouth))
         pooled.setdefault(name, []).append(pair)
     pooled["all"] = [pair for pairs in pooled.values() for pair in pairs]
-    result: dict[str, dict[str, list[float]]] = {}
+    result: dict[str, dict[str, Means]] = {}
     for name, pairs in pooled.items():
         for side, errors in zip(("forecast", "persistence"), zip(*pairs, strict=True), strict=True):
-            means = np.nanmean(np.concatenate(errors), axis=0)
-            result.setdefault(name, {})[side] = [round(1e3 * float(value), 4) for value in means]
+            joined = np.concatenate(errors)
+            known = np.isfinite(joined).any(axis=0)
+            means = [round(1e3 * float(value), 4) for value in np.nanmean(joined[:, known], axis=0)]
+            # errors of a run are known up to a horizon, and of none beyond
+            result.setdefault(name, {})[side] = [*means, *[None] * int((~known).sum())]
     return result
 
 
-def error_table(errors: dict[str, dict[str, list[float]]], name: str) -> str:
+def error_table(errors: dict[str, dict[str, Means]], name: str) -> str:
     """The errors as Markdown."""
+
+    def shown(pair: tuple[float | None, ...]) -> str:
+        return " / ".join("–" if value is None else f"{value:.2f}" for value in pair)
+
     count = len(errors["all"]["forecast"])
-    rows = [
-        [clip, *(f"{a:.2f} / {b:.2f}" for a, b in zip(*row.values(), strict=True))]
-        for clip, row in errors.items()
-    ]
+    rows = [[clip, *map(shown, zip(*row.values(), strict=True))] for clip, row in errors.items()]
     title = f"Mean distance across the view in mm by frame ahead: {name} / persistence"
     return "\n".join([title, "", *markdown_table(["clip", *map(str, range(1, count + 1))], rows)])

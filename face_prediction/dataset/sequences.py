@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 from annotated_types import Interval
+from numpy.typing import NDArray
 
 from face_prediction.motion.attribution import Attribution
 from face_prediction.motion.motion import Quality, QualityLimits, assess
@@ -190,10 +191,7 @@ def clip_frames(track: FaceTrack, settings: SequenceSettings) -> ClipFrames:
         interpolated = (made | guessed) & samples.valid
     mouth, orientation, jaw = lift_landmarks(samples.landmarks, samples.valid, track.image_size)
     times, wanted = track.source_timestamps, samples.timestamps
-    after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    is_later = wanted - times[before] > times[after] - wanted + SAME_TIME
-    nearest = np.where(is_later, after, before)
+    decoded = nearest(wanted, times)
     return ClipFrames(
         landmarks=samples.landmarks.astype(np.float32),
         valid=samples.valid,
@@ -202,11 +200,22 @@ def clip_frames(track: FaceTrack, settings: SequenceSettings) -> ClipFrames:
         mouth=mouth,
         orientation=orientation,
         jaw=jaw,
-        source_frame=nearest,
-        image_lag=times[nearest] - wanted,
+        source_frame=decoded,
+        image_lag=times[decoded] - wanted,
         image_size=track.image_size,
         quality=assess(mouth, orientation, jaw, fps, settings.limits),
     )
+
+
+def nearest(wanted: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Index (T,) of the frame nearest to each of ``wanted`` (T,); of two as near, the earlier.
+
+    ``times`` (N,) increase.
+    """
+    after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    is_later = wanted - times[before] > times[after] - wanted + SAME_TIME
+    return np.where(is_later, after, before)
 
 
 def find_sequences(frames: ClipFrames, settings: SequenceSettings) -> Sequences:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.dataset.histories import dataset_image
-from face_prediction.dataset.sequences import SequenceSettings
+from face_prediction.dataset.sequences import SequenceSettings, nearest
 from face_prediction.prediction.interface import (
     FaceFollower,
     ImageNeeds,
@@ -63,14 +63,6 @@ def landmarks_at(
     part = weight[made, None, None]
     result[made] = (1 - part) * landmarks[before[made]] + part * result[made]
     return result
-
-
-def nearest(wanted: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index (T,) of the frame nearest to each of ``wanted`` (T,); of two as near, the earlier."""
-    after = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    is_later = wanted - times[before] > times[after] - wanted + SAME_TIME
-    return np.where(is_later, after, before)
 
 
 @dataclass(frozen=True)

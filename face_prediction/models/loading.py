@@ -68,6 +68,8 @@ def save_residual(
 ) -> None:
     """Write the weights of residual prediction, and baselines fitted to the same people.
 
+    The record, without which the weights are none, is written last.
+
     Raises:
         RequestError: the folder cannot be written to.
     """
@@ -75,14 +77,26 @@ def save_residual(
 
     from face_prediction.models.learned import save_predictor_checkpoint, write_tensors
 
-    tensors = {name: torch.from_numpy(array).float() for name, array in fit.arrays().items()}
-    save_predictor_checkpoint(folder, record, tensors)
     arrays = {
         f"{forecaster.name}/{name}": torch.from_numpy(array.copy())
         for forecaster in baselines
         for name, array in forecaster.arrays().items()
     }
     write_tensors(folder / BASELINES_FILE, arrays, {"train_subjects": record.train_subjects})
+    tensors = {name: torch.from_numpy(array).float() for name, array in fit.arrays().items()}
+    save_predictor_checkpoint(folder, record, tensors)
+
+
+def holds_residual(path: Path) -> bool:
+    """Return whether a file is one of tensors that `save_residual` writes.
+
+    Raises:
+        RequestError: it holds no tensors that this package wrote.
+    """
+    from face_prediction.models.learned import read_tensors
+
+    tensors, record, _ = read_tensors(path)
+    return "basis" in tensors or (path.name == BASELINES_FILE and "train_subjects" in record)
 
 
 def load_baselines(folder: str | Path) -> tuple[list[Forecaster], frozenset[str]]:

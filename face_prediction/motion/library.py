@@ -337,11 +337,15 @@ def with_people(library: RecordedMotion, test: Sequence[str]) -> RecordedMotion:
 
 
 def motion_statistics(motion: ClipMotion, subject: str) -> dict[str, Any]:
-    """Counts of frames of one clip, tremor in mm, speeds in cm/s of what is kept."""
+    """Counts of frames of one clip, tremor in mm, speeds in cm/s of what is kept.
+
+    The distance is None where no frame could be lifted.
+    """
     row: dict[str, Any] = {"subject": subject, **motion.counts()}
     row["seconds"] = round(motion.seconds, 2)
     row["depth_smoothed"] = motion.depth_smoothed
-    row["distance_m"] = round(float(-np.nanmedian(motion.raw_depth)), 3)
+    depth = motion.raw_depth[np.isfinite(motion.raw_depth)]
+    row["distance_m"] = round(float(-np.median(depth)), 3) if len(depth) else None
     row["raw_depth_tremor_mm"] = round(1000 * step_tremor(motion.raw_depth), 2)
     if motion.runs:
         kept = [motion.mouth[a:b] for a, b in motion.runs]
@@ -391,7 +395,7 @@ def save_motion(path: Path, motion: RecordedMotion) -> None:
     for name in LIBRARY_FILE.arrays:
         value = getattr(motion, name)
         if name == "metadata":
-            value = json.dumps(value, sort_keys=True)
+            value = json.dumps(value, sort_keys=True, allow_nan=False)  # no reader takes NaN
         if value is not None:
             arrays[name] = np.asarray(value)
     write_npz(path, arrays)

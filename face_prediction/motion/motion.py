@@ -192,6 +192,10 @@ class MotionSettings:
     def __post_init__(self) -> None:
         require_ranges(self, "--{} {}")
 
+    def window(self, fps: float) -> int:
+        """Frames of an episode at ``fps`` frames per second, two or more."""
+        return max(round(self.min_run * fps), 1) + 1
+
 
 @dataclass(frozen=True)
 class ClipMotion:
@@ -273,7 +277,7 @@ def lift(track: FaceTrack, settings: MotionSettings) -> ClipMotion:
         orientation[part] = continuous_quaternions(orientation[part])
         if cutoff is not None:
             mouth[part] = smooth_depth(mouth[part], cutoff / track.fps)
-    window = round(settings.min_run * track.fps) + 1
+    window = settings.window(track.fps)
     return ClipMotion(
         fps=track.fps,
         timestamps=track.timestamps,

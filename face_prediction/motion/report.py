@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -224,12 +225,12 @@ def write_report(path: Path, library: RecordedMotion, clips: Iterable[LiftedClip
     Raises:
         RequestError: matplotlib is missing, or the page exists without the marks.
     """
-    blocks = [tables(library)]
+    plots: dict[str, bytes] = {}
     for clip in clips:
         name, motion = clip.row.clip, clip.motion
         if len(motion.timestamps) > library.metadata["settings"]["min_run"] * motion.fps:
-            blocks.append(_plotted(path, name, motion))
-    _rewrite(path, blocks, (BEGIN, END))
+            plots[name] = draw_clip(name, motion)
+    _rewrite(path, tables(library), plots, (BEGIN, END))
 
 
 def write_splice_report(
@@ -242,33 +243,37 @@ def write_splice_report(
     Raises:
         RequestError: matplotlib is missing, or the page exists without the marks.
     """
-    blocks = [splice_tables(library)]
+    plots: dict[str, bytes] = {}
     for clip in spliced:
         marks = {"mirrored": clip.mirrored, "blended": clip.blended}
-        blocks.append(_plotted(path, clip.name, clip.motion, marks))
-    _rewrite(path, blocks, SPLICE_MARKS)
+        plots[clip.name] = draw_clip(clip.name, clip.motion, marks)
+    _rewrite(path, splice_tables(library), plots, SPLICE_MARKS)
 
 
-def _plotted(
-    page: Path, name: str, motion: ClipMotion, marks: Mapping[str, np.ndarray] | None = None
-) -> str:
-    """Draw the plot of a clip beside the page, and return the Markdown that shows it."""
-    plot = plot_path(page, name)
-    plot_clip(plot, name, motion, marks)
-    return f"![Motion of {name}]({IMAGES}/{plot.name})"
+def _rewrite(path: Path, text: str, plots: Mapping[str, bytes], marks: tuple[str, str]) -> None:
+    """Put Markdown and plots, by the names of their clips, between the marks of a page.
 
-
-def _rewrite(path: Path, blocks: Sequence[str], marks: tuple[str, str]) -> None:
-    """Put blocks of Markdown between the marks of a page."""
+    Plots that it will no longer show are removed, and the page is written before the others: a plot
+    that no page shows would be in the way of the next report.
+    """
     begin, end = marks
     before, rest = read_page(path, marks).split(begin)
-    write_text(path, before + "\n\n".join([begin, *blocks, end]) + rest.split(end)[1])
+    ours, after = rest.split(end)
+    shown = [f"![Motion of {name}]({IMAGES}/{plot_path(path, name).name})" for name in plots]
+    page = before + "\n\n".join([begin, text, *shown, end]) + after
+    for link in set(re.findall(rf"\]\({IMAGES}/motion_[^/\n]+?\.png\)", ours)):
+        if link not in page:
+            (path.parent / link[2:-1]).unlink(missing_ok=True)
+    write_text(path, page)
+    for name, plot in plots.items():
+        with atomic_file(plot_path(path, name)) as temporary:
+            temporary.write_bytes(plot)
 
 
-def plot_clip(
-    path: Path, name: str, motion: ClipMotion, marks: Mapping[str, np.ndarray] | None = None
-) -> None:
-    """Draw ``motion`` to the PNG at ``path``, with the ``marks`` (T,) of spliced motion.
+def draw_clip(
+    name: str, motion: ClipMotion, marks: Mapping[str, np.ndarray] | None = None
+) -> bytes:
+    """Draw ``motion``, with the ``marks`` (T,) of spliced motion; return a PNG.
 
     Raises:
         RequestError: matplotlib is not installed.
@@ -322,8 +327,7 @@ def plot_clip(
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(64)
     stream = io.BytesIO()
     image.save(stream, "png", optimize=True)
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(stream.getvalue())
+    return stream.getvalue()
 
 
 def euler_angles(orientation: np.ndarray) -> np.ndarray:
@@ -340,6 +344,9 @@ def euler_angles(orientation: np.ndarray) -> np.ndarray:
 
 
 def _draw_position(axes: Any, seconds: np.ndarray, motion: ClipMotion) -> None:
+    axes.set_ylabel("mouth from first kept, mm")
+    if not motion.quality.found.any():
+        return
     first = motion.runs[0][0] if motion.runs else int(np.argmax(motion.quality.found))
     origin = motion.mouth[first]
     if motion.depth_smoothed:
@@ -361,7 +368,6 @@ def _draw_position(axes: Any, seconds: np.ndarray, motion: ClipMotion) -> None:
         low, high = min(low, kept.min()), max(high, kept.max())
     margin = 0.08 * (high - low) + 1
     axes.set_ylim(low - margin, high + margin)
-    axes.set_ylabel("mouth from first kept, mm")
     axes.legend(loc="upper right", ncols=4, fontsize="small")
 
 

@@ -41,8 +41,8 @@ class SpliceSettings:
         min_stretch: Seconds of the shortest stretch that is used.
         max_turn: Degrees between two heads that are blended, on average.
         max_gap: Metres between two mouths that are blended, on average.
-        max_spliced: Seconds of spliced motion of one person, at most; by default so many that
-            nobody makes up more than a fifth of the library that ships.
+        max_spliced: Seconds of spliced motion of one person after which no stretch is added; by
+            default so many that nobody makes up more than a fifth of the library that ships.
     """
 
     splice: bool = False
@@ -285,7 +285,7 @@ def splice_clips(
         middle = given[0].mouth.mean(axis=0)
         given = [replace(s, mouth=s.mouth - s.mouth.mean(axis=0) + middle) for s in given]
         fps = own[0][1].fps
-        window = round(cuts.min_run * fps) + 1
+        window = cuts.window(fps)
         chains = join_stretches(given, settings, fps)
         long_enough = [chain for chain in chains if len(chain) >= window]
         for number, chain in enumerate(long_enough):
@@ -321,7 +321,7 @@ def _cut(
     mouth, orientation, jaw, blended, mirrored = chain.parts
     orientation = continuous_quaternions(orientation)
     quality = assess(mouth, orientation, jaw, fps, cuts.limits)
-    window = round(cuts.min_run * fps) + 1
+    window = cuts.window(fps)
     motion = ClipMotion(
         fps=fps,
         timestamps=np.arange(len(jaw)) / fps,

@@ -11,6 +11,7 @@ import tempfile
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
+from http.client import HTTPException
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -73,7 +74,7 @@ def find_model(
         with urllib.request.urlopen(url, timeout=TIMEOUT_S) as response:
             logger.info("downloading %s to %s", url, path)
             data = response.read()
-    except OSError as error:  # URLError is one
+    except (OSError, HTTPException) as error:  # URLError is of the former, a break of the latter
         raise RequestError(
             f"no model at {path} and none could be downloaded ({getattr(error, 'reason', error)}); "
             f"on a machine with a network fetch {url}, then put it there"

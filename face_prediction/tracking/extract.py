@@ -28,7 +28,14 @@ from face_prediction.tracking.geometry import (
     read_canonical_face,
     slerp,
 )
-from face_prediction.tracking.tracks import NUM_LANDMARKS, FaceTrack, NoFaceError, Size, load_track
+from face_prediction.tracking.tracks import (
+    NUM_LANDMARKS,
+    TRACK_FILE,
+    FaceTrack,
+    NoFaceError,
+    Size,
+    load_track,
+)
 from face_prediction.tracking.video import DECODING, VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
@@ -335,8 +342,8 @@ class RowStore:
         self._bytes = bytearray()
 
     def append(self, rows: np.ndarray) -> None:
-        """Append rows (T, *shape), converted to the type of the store."""
-        self._bytes += np.ascontiguousarray(rows, dtype=self._dtype).data.cast("B")
+        """Append rows (T, *shape), perhaps none, converted to the type of the store."""
+        self._bytes += np.ascontiguousarray(rows, dtype=self._dtype).reshape(-1).view(np.uint8).data
 
     def array(self) -> np.ndarray:
         """All rows, without a copy; nothing may be appended afterwards."""
@@ -423,7 +430,8 @@ def extract_track(
     ``label`` is that of a progress bar, None: no bar.
 
     Raises:
-        RequestError: the video cannot be read to its end, or not as a player shows it.
+        RequestError: the video cannot be read to its end, or not as a player shows it, or is longer
+            than a track may be.
         NoFaceError: no frame of it shows a face.
     """
     digest = file_digest(path)
@@ -434,10 +442,13 @@ def extract_track(
         detect = zooming.detect
     builder = TrackBuilder(settings.fps, settings.max_gap)
     frames = damaged = with_face = several = 0
+    begin = 0.0
     with VideoReader(path) as video:
         for frame in with_bar(video.frames(), video.expected_frames or None, label):
             size = (frame.image.shape[1], frame.image.shape[0])
             frames += 1
+            begin = frame.time if frames == 1 else begin
+            require_room(path, frames, frame.time - begin, settings.fps)
             face = None
             if frame.is_damaged:
                 damaged += 1
@@ -467,6 +478,17 @@ def extract_track(
         "average_rate": video.average_rate,
     }
     return builder.finish(source, settings.record(detector.description()))
+
+
+def require_room(path: Path, frames: int, seconds: float, fps: float | None) -> None:
+    """Raise RequestError if a track of so many decoded ``frames`` could not be read back."""
+    made = frames if fps is None else int(seconds * fps + 1e-6) + 1
+    most = TRACK_FILE.limits
+    if made > most["T"] or frames > most["S"]:
+        raise RequestError(
+            f"{path}: a track holds {most['T']} frames of {most['S']} decoded ones at most; cut "
+            "the video, or give a lower --fps"
+        )
 
 
 def is_track_up_to_date(

@@ -128,6 +128,9 @@ def load_track(path: Path) -> FaceTrack:
     values["image_size"] = tuple(values["image_size"].tolist())
     values["fps"] = float(values["fps"])
     track = FaceTrack(**values)
+    for key in ("timestamps", "source_timestamps"):
+        if not len(getattr(track, key)):
+            raise RequestError(f"{path}: '{key}' is empty; a track holds one frame or more")
     for key in ("landmarks", "head_pose"):
         if not np.all(np.isfinite(getattr(track, key)[track.valid])):
             raise RequestError(f"{path}: '{key}' holds NaN or infinity in a frame marked valid")

@@ -164,7 +164,13 @@ def test_two_names_of_one_person_become_one() -> None:
     assert {clip: row.subject for clip, row in merged.items()} == {
         "ann": "ann", "bob": "ann", "cat": "eve",
     }  # fmt: skip
+    for order in (["cat=bob", "bob=ann"], ["bob=ann", "cat=bob", "bob=ann"]):
+        assert {row.subject for row in with_one_name(rows, order).values()} == {"ann"}
     with pytest.raises(RequestError, match="--same_person bob: no pair of names; valid: NAME=OTHE"):
         with_one_name(rows, ["bob"])
+    with pytest.raises(RequestError, match="'ann' becomes two; name one, and say bob=eve if these"):
+        with_one_name(rows, ["ann=bob", "ann=eve"])
+    with pytest.raises(RequestError, match=r"goes in a circle \(ann, bob, ann\); leave one out"):
+        with_one_name(rows, ["ann=bob", "bob=ann"])
     with pytest.raises(RequestError, match="subject of --same_person 'dan'"):
         with_one_name(rows, ["dan=ann"])

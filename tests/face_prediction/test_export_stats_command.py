@@ -15,6 +15,7 @@ from face_prediction.commands import export_stats as export_stats_command
 from face_prediction.commands.cli import main
 from face_prediction.commands.export_stats import (
     ExportStatsOptions,
+    library_residuals,
     median_crop_span,
     run_export_stats,
 )
@@ -27,7 +28,7 @@ from face_prediction.evaluation.predictors import (
     batch_size,
     cross_fit,
 )
-from face_prediction.motion.library import RecordedMotion, save_motion
+from face_prediction.motion.library import RecordedMotion, load_motion, save_motion
 from face_prediction.prediction.interface import Forecast, ImageNeeds
 from face_prediction.tracking.geometry import crop_around
 from face_prediction.tracking.tracks import save_track
@@ -352,3 +353,20 @@ def test_a_library_that_cannot_be_measured_is_refused(
     assert exit_code([*command, "--out", str(out), *options]) == 2
     assert words in caplog.text
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fps": 25.0}, "is at 25 frames a second, .* at 30; give the dataset"),
+        ({"metadata": {}}, "holds no forecasts; make it with face-prediction predict"),
+        ({"predicted_mouth": None}, "holds no forecasts; make it with face-prediction predict"),
+    ],
+)
+def test_a_library_of_something_else_is_refused(
+    dataset: Path, tmp_path: Path, changes: dict[str, object], words: str
+) -> None:
+    path = predicted_library(tmp_path)
+    save_motion(path, replace(load_motion(path), **changes))
+    with FaceDataset(dataset) as opened, pytest.raises(RequestError, match=words):
+        library_residuals(opened, path, "natural")

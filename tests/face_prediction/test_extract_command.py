@@ -7,8 +7,10 @@ import hashlib
 import logging
 import subprocess
 import sys
+import threading
 import weakref
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,7 +28,7 @@ from face_prediction.tracking.detector import (
     default_model_path,
     find_model,
 )
-from face_prediction.tracking.tracks import load_track, save_track
+from face_prediction.tracking.tracks import TRACK_FILE, load_track, save_track
 from face_prediction.tracking.video import VideoReader
 from robo_manip_baselines.runs.errors import RequestError, WriteError
 
@@ -260,6 +262,21 @@ def test_few_frames_and_faces_are_held(tmp_path, write_video, run, monkeypatch) 
     assert most["faces"] <= 8 + 3  # the chunk, the newest, and the one that is followed
 
 
+@pytest.mark.parametrize(("limit", "arguments"), [("T", ()), ("T", ("--fps", "None")), ("S", ())])
+def test_a_track_that_could_not_be_read_back_is_not_made(
+    tmp_path: Path, write_video, run, monkeypatch, caplog, limit: str, arguments: tuple[str, ...]
+) -> None:
+    video = write_video(tmp_path / "ann.mp4", [picture(20)] * 30)
+    monkeypatch.setitem(TRACK_FILE.limits, limit, 30)
+    assert run(video, *arguments) == 0
+    (tmp_path / "tracks" / "ann.npz").unlink()
+    monkeypatch.setitem(TRACK_FILE.limits, limit, 20)
+    assert run(video, *arguments) == 2
+    assert "decoded ones at most; cut the video, or give a lower --fps" in caplog.text
+    assert StandIn.looked < 60
+    assert not any((tmp_path / "tracks").iterdir())
+
+
 def test_a_killed_run_leaves_whole_files_and_carries_on(
     tmp_path: Path, write_video, run, monkeypatch, caplog
 ) -> None:
@@ -277,7 +294,9 @@ def test_a_killed_run_leaves_whole_files_and_carries_on(
     assert run(*videos) == 130
     assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["a.npz"]
     monkeypatch.setattr(StandIn, "detect", detect)
+    (tmp_path / "tracks" / ".b.npz.99999999.partial").write_bytes(b"as SIGKILL leaves it")
     assert run(*videos) == 0
+    assert len(list((tmp_path / "tracks").iterdir())) == 3
     assert "2 made, 1 already up to date, 0 refused" in caplog.text
 
 
@@ -405,6 +424,23 @@ class TestModelFile:
         with pytest.raises(RequestError, match=r"fetch file:.*--detector_model") as caught:
             find_model(None, nowhere, "0")
         assert "\n" not in str(caught.value)
+
+    def test_a_download_that_breaks_off_is_not_kept(self, cache: Path) -> None:
+        class HalfAModel(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Length", "1000")
+                self.end_headers()
+                self.wfile.write(b"half a mod")
+
+            def log_message(self, *_: object) -> None: ...
+
+        with HTTPServer(("127.0.0.1", 0), HalfAModel) as server:
+            threading.Thread(target=server.handle_request, daemon=True).start()
+            address = f"http://127.0.0.1:{server.server_port}/model.task"
+            with pytest.raises(RequestError, match=r"none could be downloaded \(IncompleteRead"):
+                find_model(None, address, "0" * 64)
+        assert not cache.exists()
 
     def test_the_option_of_the_command_is_named(self, tmp_path: Path) -> None:
         nowhere = (tmp_path / "nothing").as_uri()

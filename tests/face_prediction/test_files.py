@@ -80,6 +80,10 @@ def with_value(key: str, value) -> Callable[[dict[str, np.ndarray]], None]:
     return lambda arrays: arrays.__setitem__(key, np.asarray(value))
 
 
+def without_rows(arrays: dict[str, np.ndarray]) -> None:
+    arrays |= {key: arrays[key][:0] for key in ("source_timestamps", "source_valid")}
+
+
 def with_nan(key: str, index: int = 0) -> Callable[[dict[str, np.ndarray]], None]:
     def change(arrays: dict[str, np.ndarray]) -> None:
         arrays[key] = arrays[key].copy()
@@ -109,6 +113,7 @@ def with_nan(key: str, index: int = 0) -> Callable[[dict[str, np.ndarray]], None
         (with_value("image_size", [0, 480]), "'image_size' must be positive"),
         (with_value("extra", np.zeros(3)), "unknown array 'extra.npy'"),
         (with_value("fps", np.inf), "'fps' holds NaN or infinity"),
+        (without_rows, "'source_timestamps' is empty"),
     ],
 )
 def test_a_damaged_track_is_refused_by_name(track_file: Path, change, message: str) -> None:

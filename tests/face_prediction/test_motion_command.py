@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from face_prediction.motion import report
 from face_prediction.motion.library import load_motion, save_motion
 from face_prediction.motion.report import BEGIN, END
 from face_prediction.tracking.tracks import save_track
@@ -43,7 +46,7 @@ def folder(tmp_path: Path, make_track) -> Path:
 def run(folder: Path, caplog, exit_code):
     caplog.set_level(logging.INFO)
 
-    def export(*arguments: object, tracks: Path | None = None, min_run: int = 1) -> int:
+    def export(*arguments: object, tracks: Path | None = None, min_run: float = 1) -> int:
         words = ["export-motion", str(tracks or folder / "tracks"), *map(str, arguments)]
         return exit_code([*words, "--out", str(folder / "motion.npz"), "--min_run", str(min_run)])
 
@@ -113,6 +116,35 @@ def test_the_report(folder: Path, run) -> None:
         assert f"(images/motion_{clip}.png)" in text
 
 
+def test_a_report_that_was_killed_is_written_again(folder: Path, run, monkeypatch) -> None:
+    page = folder / "page.md"
+    arguments = ("--attribution", folder / "clips.csv", "--report", page)
+    write = report.atomic_file
+
+    @contextmanager
+    def killed(path: Path) -> Iterator[Path]:
+        if path.name == "motion_steady.png":
+            raise KeyboardInterrupt
+        with write(path) as temporary:
+            yield temporary
+
+    with monkeypatch.context() as patch:
+        patch.setattr(report, "atomic_file", killed)
+        assert run(*arguments) == 130
+    assert [path.name for path in (folder / "images").iterdir()] == ["motion_lively.png"]
+    assert run(*arguments) == 0
+    assert len(list((folder / "images").iterdir())) == 2
+
+
+def test_a_plot_that_a_report_no_longer_shows_is_removed(folder: Path, make_track, run) -> None:
+    save_track(folder / "tracks" / "steady.npz", make_track(sway(60, 0.0), name="steady.mp4"))
+    arguments = ("--attribution", folder / "clips.csv", "--report", folder / "page.md")
+    for min_run, plots in ((1, {"steady", "lively"}), (3, {"lively"}), (3, {"lively"})):
+        assert run(*arguments, min_run=min_run) == 0
+        found = {path.name for path in (folder / "images").iterdir()}
+        assert found == {f"motion_{name}.png" for name in plots}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -169,6 +201,25 @@ def test_other_files_are_not_overwritten(folder: Path, run, caplog) -> None:
     assert run("--report", page) == 2
     assert page.read_text() == "a page without marks"
     assert not (folder / "motion.npz").exists()
+
+
+def test_a_clip_of_which_nothing_can_be_lifted(folder: Path, make_track, run) -> None:
+    """A face found in one decoded frame alone, between two of the track, or seen from the side."""
+    lost = make_track(sway(100, 0.0), valid=np.zeros(100, dtype=bool), name="lost.mp4")
+    save_track(folder / "tracks" / "lost.npz", lost)
+    assert run("--report", folder / "page.md") == 0
+    statistics = load_motion(folder / "motion.npz").metadata["clips"]["lost"]
+    assert statistics["distance_m"] is None
+    assert (statistics["frames"], statistics["no_face"], statistics["runs"]) == (100, 100, 0)
+    assert "motion_lost.png" in (folder / "page.md").read_text()
+
+
+def test_a_run_has_a_step_however_short_it_may_be(folder: Path, make_track, run) -> None:
+    valid = np.ones(100, dtype=bool)
+    valid[[40, 42]] = False  # frame 41 is alone
+    save_track(folder / "tracks" / "lively.npz", make_track(sway(100, 0.0), valid=valid))
+    assert run(min_run=0.01) == 0
+    assert load_motion(folder / "motion.npz").run_length.min() >= 2
 
 
 def test_what_is_left_over_is_spliced(folder: Path, run) -> None:

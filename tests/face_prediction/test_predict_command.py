@@ -185,6 +185,29 @@ def test_what_export_motion_wrote_stays_as_it_was(folder: Folder) -> None:
     assert metadata == load_motion(folder.root / "motion.npz").metadata
 
 
+def test_a_horizon_that_no_run_lasts_has_no_error(folder: Folder, capsys) -> None:
+    """Runs of 16 and 11 frames: the errors of frames ahead that only one of them has, or none."""
+    library = load_motion(folder.root / "motion.npz")
+    keep = np.r_[0:16, FRAMES : FRAMES + 11]
+    short = replace(
+        library,
+        **{key: getattr(library, key)[keep] for key in ("time", "mouth", "orientation", "jaw")},
+        run_start=np.array([0, 16]),
+        run_length=np.array([16, 11]),
+        predicted_mouth=np.repeat(library.mouth[keep, None], 20, axis=1),
+    )
+    errors = predict_command.errors_by_clip(short)
+    for side in ("forecast", "persistence"):
+        known = {name: [value is not None for value in row[side]] for name, row in errors.items()}
+        assert {name: sum(row) for name, row in known.items()} == {"ann": 15, "bob": 10, "all": 15}
+        assert known["ann"] == [True] * 15 + [False] * 5
+    assert errors["ann"]["forecast"][:2] == pytest.approx([1.0, 2.0], abs=0.01)
+    assert "| – / – |" in predict_command.error_table(errors, "still")
+    recorded = replace(short, metadata={**short.metadata, "errors": errors})
+    save_motion(folder.root / "short.npz", recorded)
+    assert load_motion(folder.root / "short.npz").metadata["errors"] == errors
+
+
 def test_only_clips_that_may_ship_are_written(folder: Folder) -> None:
     assert run_predict(folder.options()) == 0
     library = load_motion(folder.root / "predicted.npz")

@@ -8,7 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from face_prediction.tracking.extract import MAX_GAP, Resampler, Samples, resample
+from face_prediction.tracking.detector import FaceDetection
+from face_prediction.tracking.extract import (
+    CHUNK,
+    MAX_GAP,
+    Resampler,
+    Samples,
+    TrackBuilder,
+    resample,
+)
+from face_prediction.tracking.tracks import NUM_LANDMARKS
 
 
 def moving(times: np.ndarray, valid: np.ndarray | None = None) -> Samples:
@@ -126,3 +135,15 @@ def test_chunks_give_the_same_bit_for_bit(count: int, chunk: int) -> None:
         got = np.concatenate([getattr(samples, name) for samples, _ in parts])
         np.testing.assert_array_equal(got, expected)
     np.testing.assert_array_equal(np.concatenate([made for _, made in parts]), interpolated)
+
+
+def test_a_chunk_may_hold_no_frame_of_a_slow_track() -> None:
+    """At a frame in ten seconds, 256 frames of a video hold none at times."""
+    face = FaceDetection(np.zeros((NUM_LANDMARKS, 3)), np.eye(4))
+    builder = TrackBuilder(0.1, MAX_GAP)
+    for number in range(3 * CHUNK):
+        builder.add(number / 30, face, (640, 480))
+    track = builder.finish({}, {})
+    assert track.timestamps.tolist() == [0.0, 10.0, 20.0]
+    assert track.valid.all()
+    assert len(track.source_timestamps) == 3 * CHUNK

@@ -158,6 +158,8 @@ def test_what_cannot_be_forecast_is_refused(predictor: ResidualPredictor, faces)
     broken[0, 3, 7, 1] = np.nan
     with pytest.raises(RequestError, match="NaN or infinity"):
         predictor.predict(broken, None, 5)
+    with pytest.raises(RequestError, match=r"tracks of b: 34 frames at most; .* more than 34"):
+        fit_residual([*swaying(1, 150), *swaying(1, 34)], ["a", "b"])
     with pytest.raises(RequestError, match="tracks of 1 people; residual needs 2 or more"):
         fit_residual(list(faces), ["ann", "ann"])
 

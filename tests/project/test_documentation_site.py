@@ -51,6 +51,8 @@ def test_the_reference_has_every_command(documentation: ModuleType) -> None:
         "## bin/Rollout.py",
         "### bin/Train.py Act",
         "### bin/Dataset.py verify",
+        "### bin/Dataset.py export",
+        "### bin/Dataset.py import",
         "### bin/Benchmark.py foresight",
         "### face-prediction export-stats",
     ):

@@ -105,6 +105,19 @@ def test_installed_is_installed(bare_tree: Path) -> None:
     assert len(log.read_text().splitlines()) == 2
 
 
+def test_an_environment_that_was_not_finished_is_made_again(bare_tree: Path, tools: Path) -> None:
+    """A run that was stopped while it made .venv leaves a Python in it, and no pip."""
+    venv = bare_tree / ".venv" / "bin"
+    venv.mkdir(parents=True)
+    python = venv / "python"
+    python.write_text('#!/bin/sh\ncase "$2" in *pip*) exit 1;; esac\necho 3.11\n', encoding="utf-8")
+    python.chmod(0o755)
+    fit = fake_python(tools, "python3.11", "3.11")
+    result = set_up(bare_tree, path=str(tools))
+    assert f"making .venv with Python 3.11 ({fit})" in result.stdout
+    assert not python.exists()
+
+
 PIP_SAYS = """Obtaining file:///x
   Installing build dependencies: started
 Collecting av>=14.0 (from robo_manip_baselines==0.1.0)

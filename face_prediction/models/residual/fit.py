@@ -229,17 +229,25 @@ def fit_residual(tracks: Sequence[NDArray[np.floating]], subjects: Sequence[str]
     people by a fit to the other half.
 
     Raises:
-        RequestError: there are fewer than two people, or their tracks are too short.
+        RequestError: there are fewer than two people, or the tracks of either half are too short.
     """
-    names = sorted(set(subjects))
+    names, half = sorted(set(subjects)), subject_folds(subjects, 2)
     if len(names) < 2 or max(map(len, tracks), default=0) <= _WARM_UP + 2 * HORIZONS[-1]:
         needed = f"2 or more with tracks of more than {_WARM_UP + 2 * HORIZONS[-1]} frames"
         raise RequestError(f"tracks of {len(names)} people; residual needs {needed}")
+    for part in range(2):
+        own = {name for name, place in zip(subjects, half, strict=True) if place == part}
+        longest = max(len(t) for t, name in zip(tracks, subjects, strict=True) if name in own)
+        if longest <= _WARM_UP + HORIZONS[-1]:
+            raise RequestError(
+                f"tracks of {', '.join(sorted(own)[:3])}: {longest} frames at most; residual is "
+                f"fitted to each half of the people and needs one of more than "
+                f"{_WARM_UP + HORIZONS[-1]} in either; add footage of other people"
+            )
     shown = [track / face_side(track[0]) for track in tracks]
     basis = shapes_of(shown)
     series = [face_series(track, basis) for track in shown]
     people = fit_people(series, subjects)
-    half = subject_folds(subjects, 2)
     blank = IntervalFit(
         np.zeros((len(HORIZONS), 2, SIGNS + 1)), np.zeros((len(HORIZONS), 2, len(LEVELS)))
     )

@@ -105,7 +105,10 @@ def test_a_second_run_makes_nothing_and_a_third_only_what_is_missing(folder, cap
     assert [path.stat().st_mtime_ns for path in paths] == times
     paths[1].unlink()
     (folder.root / "dataset" / "dataset.json").unlink()  # as a killed run leaves it
+    left = paths[1].with_name(".two.h5.99999999.partial")
+    left.write_bytes(b"half a clip")
     assert folder.run() == 0
+    assert not left.exists()
     assert "1 made, 3 already up to date, 0 refused" in caplog.text
     assert [path.read_bytes() for path in paths] == before  # the same bytes, too
     assert (folder.root / "dataset" / "dataset.json").read_bytes() == manifest

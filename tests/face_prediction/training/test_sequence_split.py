@@ -224,3 +224,32 @@ def test_fit_sees_no_frame_that_is_reported_on(
         run_fit(replace(options, test_fold=None))
     with pytest.raises(RequestError, match="--test_fold 10: no such fold; valid: 0 to 9"):
         run_fit(replace(options, test_fold=10))
+
+
+def test_what_a_killed_fit_left_is_not_in_the_way(
+    opened: FaceDataset, tmp_path: Path, monkeypatch
+) -> None:
+    """The record is written last; without it the other files are those of a fit that was begun."""
+    loading = pytest.importorskip("face_prediction.models.loading")
+    learned = pytest.importorskip("face_prediction.models.learned")
+    fits = pytest.importorskip("face_prediction.models.residual.fit")
+    shipped, _ = loading.load_predictor("shipped")
+    monkeypatch.setattr(fits, "fit_residual", lambda *_: shipped.fit)
+    out = tmp_path / "out"
+    options = FitOptions(opened.folder, out=out)
+    whole = {"attribution.csv", "baselines.safetensors", "model.safetensors", "config.json"}
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learned, "write_json", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run_fit(options)
+    assert {path.name for path in out.iterdir()} == whole - {"config.json"}
+    assert run_fit(options) == 0
+    assert {path.name for path in out.iterdir()} == whole
+    (out / "config.json").unlink()
+    (out / "attribution.csv").write_text("somebody,else\n")
+    with pytest.raises(RequestError, match=r"holds attribution.csv and no weights"):
+        run_fit(options)
