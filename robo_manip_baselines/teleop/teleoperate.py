@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,7 +37,7 @@ from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY
 from robo_manip_baselines.runs.ranges import Episodes, Quality, Seed, require_ranges
 from robo_manip_baselines.teleop.device import DEVICES, TeleopDevice, make_device
 from robo_manip_baselines.teleop.options import SteeringOptions
-from robo_manip_baselines.teleop.recording import EpisodeStore, free_seeds
+from robo_manip_baselines.teleop.recording import EpisodeStore
 from robo_manip_baselines.teleop.replay import ReplayDevice
 from robo_manip_baselines.teleop.session import SessionSummary, TeleopSession
 from robo_manip_baselines.teleop.shared import CheckpointPolicy, read_shared
@@ -257,14 +257,20 @@ def _require_same_world(path: Path, config: TeleopConfig, kwargs: Mapping[str, A
 
 
 def _seeds(config: TeleopConfig, device: TeleopDevice, store: EpisodeStore) -> list[int]:
-    """Return the seeds that are still to be recorded.
+    """Return the seeds that are still to be recorded; none where only images are left to draw.
 
     Raises:
-        RequestError: there is none.
+        RequestError: there is nothing left to do.
     """
+    wanted: Sequence[int] = range(config.first_seed, config.first_seed + config.num_episodes)
+    problem = (
+        f"holds all episodes of the seeds {wanted[0]} to {wanted[-1]}; give another --seed or more "
+        "--num_episodes"
+    )
     if isinstance(device, ReplayDevice):
-        seeds = [seed for seed in device.seeds if seed not in store.seeds]
-        if not seeds and not store.waiting:
-            raise RequestError(f"'{config.out}' holds an episode of every seed played back")
-        return seeds
-    return list(free_seeds(config.out, config.first_seed, config.num_episodes, store.seeds))
+        wanted, problem = device.seeds, "holds an episode of every seed played back"
+    taken = store.seeds
+    seeds = [seed for seed in wanted if seed not in taken]
+    if not seeds and not store.waiting:
+        raise RequestError(f"'{config.out}' {problem}")
+    return seeds

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.rollout.demonstrate import Collection, collect, deviation
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.teleop import recording
+from robo_manip_baselines.teleop import recording, teleoperate
 
 pytestmark = pytest.mark.long
 
@@ -98,6 +99,28 @@ def test_a_session_draws_what_a_killed_one_left(recorded: Recorded, tmp_path: Pa
     assert verify_dataset(out) == []
     with pytest.raises(RequestError, match="holds an episode of every seed played back"):
         play_back(recorded(), out, *size)
+
+
+@pytest.mark.gl
+def test_the_same_command_draws_what_is_left_where_every_seed_is_recorded(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """Of devices that a person moves: nobody is asked to, and the session ends."""
+    out, size = tmp_path / "out", ("--cameras", "top", "--image_size", "24x32")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording.EpisodeStore, "poll", lambda store: "")
+        patch.setattr(recording.EpisodeStore, "finish", lambda store: None)
+        play_back(recorded(), out, *size)
+    again = ["FeedingEnv", "--device", "web", "--num_episodes", "1", "--out", str(out), *size]
+    device = SimpleNamespace(is_paced=False, close=lambda: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(teleoperate, "open_device", lambda *_: device)
+        teleop.main(again)
+        (path,) = list_episodes(out)
+        with EpisodeReader(path) as episode:
+            assert episode.cameras == ("top",)
+        with pytest.raises(RequestError, match="holds all episodes of the seeds 0 to 0; give"):
+            teleop.main(again)
 
 
 @pytest.mark.gl
