@@ -12,6 +12,7 @@ from typing import Annotated, Any
 from annotated_types import Interval
 
 from robo_manip_baselines.data import EpisodeReader, list_episodes
+from robo_manip_baselines.data.demonstrations import SHOWN
 from robo_manip_baselines.data.files import UNRENDERED_FOLDER
 from robo_manip_baselines.data.schema import TELEOP
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, viewer_problem
@@ -229,7 +230,7 @@ def _episode_paths(config: TeleopConfig) -> list[Path]:
     return paths[: config.num_episodes]
 
 
-_DRAWING = ("cameras", "image_size", "render_size", "shadows", "multisamples", "obs", "horizon")
+_LOOKS = SHOWN | {"shadows", "multisamples", "render_mode"}
 """Arguments of the environment that say nothing of how the world goes on."""
 
 
@@ -242,12 +243,12 @@ def _require_same_world(path: Path, config: TeleopConfig, kwargs: Mapping[str, A
     with EpisodeReader(path) as episode:
         known = episode.attributes
     worlds = [
-        {k: v for k, v in without_library_path(item).items() if k not in _DRAWING}
+        {k: v for k, v in without_library_path(item).items() if k not in _LOOKS}
         for item in ({"face_motion": "episode", **known["env_kwargs"]}, kwargs)
     ]
     if known["env_id"] != config.task.env_id:
         raise RequestError(f"'{path}' is of {known['env_id']}, not of {config.env}")
-    for name in sorted({*worlds[0], *worlds[1]} - {"arms"}):
+    for name in sorted({*worlds[0], *worlds[1]}):
         recorded, ours = (json.dumps(world.get(name)) for world in worlds)
         if recorded != ours:
             raise RequestError(

@@ -185,6 +185,21 @@ def test_the_world_must_be_the_recorded_one(recorded: Recorded, tmp_path: Path) 
         play_back(recorded(), tmp_path / "out", "--cameras", "none", "--motion", "still")
 
 
+def test_what_an_expert_was_shown_is_no_part_of_the_world(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """As by a servo that goes by a camera; the command has no such options."""
+    with EpisodeReader(list_episodes(recorded())[0]) as episode:
+        derived = {item.name for item in episode.schema.attributes if item.is_derived}
+        known = {k: v for k, v in episode.attributes.items() if k not in derived}
+        arrays = dict(episode.arrays)
+    shown = {"mouth_source": "camera", "camera_latency": 2, "render_mode": "rgb_array"}
+    known["env_kwargs"] = known["env_kwargs"] | shown
+    recording.write_episode(tmp_path / "camera" / "episode_000000.hdf5", arrays, {}, known)
+    play_back(tmp_path / "camera", tmp_path / "out")
+    assert len(list_episodes(tmp_path / "out")) == 1
+
+
 def test_the_left_arm_alone(recorded: Recorded, tmp_path: Path) -> None:
     """The task's one arm stays where it is; the files have both."""
     with pytest.raises(RequestError, match="moves the arm right, not left"):
