@@ -101,7 +101,10 @@ def test_what_a_killed_run_left_is_removed(run_folder: Path, tmp_path: Path) -> 
     gone = 2**22 + 1  # no process has such a number
     videos = tmp_path / "videos"
     videos.mkdir()
-    left = [tmp_path / f".results.jsonl.{gone}.partial", videos / f".seed_001000.mp4.{gone}.partial"]
+    left = [
+        tmp_path / f".results.jsonl.{gone}.partial",
+        videos / f".seed_001000.mp4.{gone}.partial",
+    ]
     for path in left:
         path.touch()
     settings = EvaluationPlan.of(config(run_folder, out=tmp_path)).settings

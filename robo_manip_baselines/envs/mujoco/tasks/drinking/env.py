@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -17,6 +18,7 @@ from robo_manip_baselines.envs.mujoco.tasks.drinking.cup import (
     add_cup,
 )
 from robo_manip_baselines.envs.mujoco.tasks.drinking.liquid import (
+    SERVING,
     Liquid,
     jet_at,
     outflow_speed,
@@ -279,6 +281,11 @@ class DrinkingEnv(FaceEnv):
         liquid = self.liquid
         shares = np.array([liquid.delivered_share, liquid.spilled_share])
         return {"object_pose": self.object_pose, "liquid": shares}
+
+    def show_row(self, row: Mapping[str, NDArray[Any]]) -> None:
+        """Show the liquid that was left, without a jet."""
+        left, up = SERVING * max(1.0 - float(row["liquid"].sum()), 0.0), self.cup_axes[2]
+        self._view.show(self.model, surface_height(left, up), up, NO_DROPS)
 
     def start_attributes(self) -> dict[str, Any]:
         """Return what `FaceEnv` does, and the cup's start."""
