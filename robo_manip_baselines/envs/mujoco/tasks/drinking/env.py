@@ -167,13 +167,15 @@ class DrinkingEnv(FaceEnv):
     mouth in images of ``front_close`` (needs the extra ``face_prediction`` and OpenGL) |
     | ``camera_latency`` | 1 | frames of 1/30 s from an image to its report, or ``"measured"`` |
     | ``arms`` | ``"right"`` | right or both |
+    | ``face`` | ``"visual"`` | kind of face: visual, or physical, soft tissue on a head that
+    yields |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
     | ``people`` | ``"all"`` | all, or train or test: different people, drawn before their starts |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
-    | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
-    None |
+    | ``motion_library`` | None | a file of ``face_prediction export-motion``, or ``"extended"``,
+    the shipped one with more people; the shipped one of recordings alone if None |
     | ``motion_sha256`` | None | digest of the library's motion; any if None |
     | ``shadows``, ``multisamples`` | False, 0 | prettier and slower images, for videos |
     | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;

@@ -94,7 +94,7 @@ class FaceWipingEnv(FaceEnv):
 
     ## Arguments
 
-    Those of `FeedingEnv`, without ``object_pose``.
+    Those of `FeedingEnv`, without ``object_pose`` and ``utensil``.
 
     ## Version history
 
