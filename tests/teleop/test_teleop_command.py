@@ -149,6 +149,8 @@ def test_actions_that_lead_elsewhere_are_noticed(recorded: Recorded, tmp_path: P
         (["--image_codec", "gif"], "unknown image codec 'gif'"),
         (["--motion", "flying"], "flying"),
         (["--episodes", "there", "--arm", "left"], "there"),
+        (["--port", "9"], "--port goes with --device web or spacemouse, not with replay"),
+        (["--device", "web", "--mice", "/dev/hidraw3"], "--mice goes with --device keyboard or sp"),
     ],
 )
 def test_what_is_wrong_is_one_line(options: list[str], message: str, tmp_path: Path) -> None:
