@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from annotated_types import Interval
 
+from robo_manip_baselines.commands.rollout import changed_options
 from robo_manip_baselines.observation import Corruption
 from robo_manip_baselines.runs.browser import PageOptions, require_viser
 from robo_manip_baselines.runs.command import parse
@@ -81,7 +82,7 @@ class Plot:
         from robo_manip_baselines.data.episode import EpisodeReader
         from robo_manip_baselines.runs.files import atomic_file
 
-        out = self.out or Path(self.episode.with_suffix(".png").name)
+        out = self.out or Path(f"{self.episode.stem or 'episode'}.png")
         kind = require_choice("--out: image of type", out.suffix, IMAGE_TYPES)
         if out.exists():
             raise RequestError(f"'{out}': is there already; choose another file with --out")
@@ -463,10 +464,10 @@ class Export:
 
     def _require_unused(self, names: Sequence[str]) -> None:
         """Refuse options that the format has no use for."""
-        defaults = Export(self.folder, self.out, self.format)
-        for name in names:
-            if getattr(self, name) != getattr(defaults, name):
-                raise RequestError(f"--{name}: not for the format {self.format}; leave it out")
+        usual = Export(self.folder, self.out, self.format)
+        given = replace(usual, **{name: getattr(self, name) for name in names})
+        if changed := changed_options(given, usual):
+            raise RequestError(f"--{changed[0]}: not for the format {self.format}; leave it out")
 
 
 def _require_elsewhere(folder: Path, out: Path) -> None:

@@ -228,9 +228,9 @@ def require_consistent(options: RolloutOptions) -> None:
             "--policy Act --checkpoint runs/... to let a trained policy act"
         )
     given = options.evaluation if options.scripted else options.demonstration
-    changed = _changed_options(given, type(given)())
+    changed = changed_options(given, type(given)())
     if options.scripted:
-        changed += [n for n in _changed_options(options.spec, UNTRAINED) if n not in RECORDED]
+        changed += [n for n in changed_options(options.spec, UNTRAINED) if n not in RECORDED]
         changed += [] if options.corruption else ["no_corruption"]
     if changed:
         wanted = "--policy" if options.scripted else "--scripted"
@@ -239,13 +239,13 @@ def require_consistent(options: RolloutOptions) -> None:
         require_viewer()
 
 
-def _changed_options(given: Any, default: Any) -> list[str]:
+def changed_options(given: Any, default: Any) -> list[str]:
     """Return the options, as they are written, in which two dataclasses differ."""
     names: list[str] = []
     for item in fields(given):
         value, before = getattr(given, item.name), getattr(default, item.name)
         if isinstance(value, Corruption):
-            parts = _changed_options(value, before)
+            parts = changed_options(value, before)
             names += ["corruption_seed" if name == "seed" else name for name in parts]
         elif value != before:
             names.append(f"no_{item.name}" if value is False else item.name)

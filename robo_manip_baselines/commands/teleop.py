@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from annotated_types import Interval
 
-from robo_manip_baselines.commands.rollout import face_arguments
+from robo_manip_baselines.commands.rollout import changed_options, face_arguments
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
@@ -101,7 +101,7 @@ class TeleopOptions:
         motion_library: File of recorded face motion, or extended, which ships, too.
         images: Images of the episodes.
         replay: Only with --device replay.
-        page: Only with --device web.
+        page: Only with --device web, or spacemouse where there is no display.
         steering: Speed of the hand; only with --device keyboard or spacemouse.
         shared: A policy that acts until the person takes over.
     """
@@ -141,12 +141,22 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
     task, images = task_entry(options.env), options.images
     if options.replay.episodes and options.device != "replay":
         raise RequestError("--episodes goes with --device replay; leave it out")
+    device = options.device or default_device()
+    for given, usual, devices in (
+        (options.page, PageOptions(), ("web", "spacemouse")),  # the page may be a mouse's screen
+        (options.steering, SteeringOptions(), ("keyboard", "spacemouse")),
+    ):
+        if device not in devices and (changed := changed_options(given, usual)):
+            raise RequestError(
+                f"--{changed[0]} goes with --device {' or '.join(devices)}, not with {device}; "
+                "leave it out"
+            )
     limit = options.time_limit
     spec = ObservationSpec(cameras=images.cameras, image_size=images.image_size)
     return TeleopConfig(
         env=options.env,
         out=options.out or Path("dataset") / "teleop" / options.env,
-        device=options.device or default_device(),
+        device=device,
         arm=options.arm or task.arms[0],
         first_seed=options.seed,
         num_episodes=options.num_episodes,

@@ -117,7 +117,7 @@ def split_episodes(seeds: Iterable[int], fraction: float, seed: int) -> Split:
     return Split(tuple(sorted(shuffled[held_out:])), tuple(sorted(shuffled[:held_out])))
 
 
-_SHOWN = {field.name for field in fields(ObservationSpec)} | {"error"}
+SHOWN = {field.name for field in fields(ObservationSpec)} | {"error"}
 """Arguments of an environment that say what it shows (``error``: in older files); files hold truth,
 whatever was shown."""
 
@@ -422,4 +422,4 @@ def _drawn_size(attributes: Mapping[str, Any]) -> tuple[int, int]:
 def _world(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of the environment that say more than what it shows."""
     kwargs = attributes["env_kwargs"]
-    return {name: kwargs[name] for name in sorted(kwargs) if name not in _SHOWN}
+    return {name: kwargs[name] for name in sorted(kwargs) if name not in SHOWN}

@@ -155,6 +155,9 @@ class RecordedWorld:
 
     def load(self, episode: EpisodeReader) -> None:
         """Take the states of an episode."""
+        self._env.reset(seed=int(episode.attributes["seed"]))  # places what is only drawn
+        own = [item.name for item in episode.task.fields if item.name in episode.fields]
+        self._rows = {name: episode.array(name) for name in own}
         self._qpos = episode.array("qpos")
         self._poses = self.world.face.placed_bodies(
             episode.array("mouth_position")[:, 0],
@@ -171,6 +174,8 @@ class RecordedWorld:
             if place >= 0:  # a physical face moves by its joints, but for the mouth and the bust
                 data.mocap_pos[place] = position[step]
                 data.mocap_quat[place] = orientation[step]
+        mujoco.mj_kinematics(model, data)
+        self.world.show_row({name: values[step] for name, values in self._rows.items()})
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
         return data

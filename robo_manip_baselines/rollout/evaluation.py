@@ -53,7 +53,7 @@ from robo_manip_baselines.rollout.workers import EnvConfig, open_envs
 from robo_manip_baselines.runs.checkpoints import CHECKPOINTS
 from robo_manip_baselines.runs.documents import as_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
-from robo_manip_baselines.runs.files import locked, write_json
+from robo_manip_baselines.runs.files import locked, remove_temporaries, write_json
 from robo_manip_baselines.runs.progress import EpisodeProgress
 from robo_manip_baselines.runs.ranges import NonNegativeInt, Processes, require_ranges
 from robo_manip_baselines.runs.versions import software_versions
@@ -449,6 +449,7 @@ def evaluate(config: EvaluationConfig) -> tuple[EvaluationPlan, EvaluationSummar
 
 def _evaluate(plan: EvaluationPlan) -> tuple[EvaluationSummary, list[Path]]:
     """Run the episodes that the folder of a plan lacks, write summary and videos."""
+    remove_temporaries(plan.out, plan.out / VIDEOS)
     config = plan.config
     seeds, number, split = config.seeds, config.videos, plan.checkpoint.split
     if known := sorted(set(seeds) & {*split.train, *split.validation}):

@@ -173,8 +173,17 @@ class _Clip:
         self.tile = np.concatenate([put_caption(strip, label), np.zeros((*self.size, 3), np.uint8)])
 
     def advance(self) -> bool:
-        """Show the next frame; return False, and keep the last, at the end."""
-        frame = next(self._frames, None)
+        """Show the next frame; return False, and keep the last, at the end.
+
+        Raises:
+            RequestError: the video is damaged.
+        """
+        import av.error  # slow to import
+
+        try:
+            frame = next(self._frames, None)
+        except (av.error.FFmpegError, OSError) as error:
+            raise RequestError(f"'{self.path}' is damaged: {error}; evaluate again") from error
         if frame is None:
             return False
         image = frame.to_ndarray(format="rgb24")[:, self._columns]

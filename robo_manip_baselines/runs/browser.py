@@ -116,6 +116,12 @@ class Gate:
             target: path and query.
             headers: mapping of names, in any case, to values.
         """
+        try:
+            return self._refusal(target, headers)
+        except ValueError:  # an address that is none, or bytes that are no text
+            return HTTPStatus.BAD_REQUEST, {}, "This request is malformed.\n"
+
+    def _refusal(self, target: str, headers: Any) -> tuple[int, dict[str, str], str] | None:
         given, origin = headers.get("Host", ""), headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != given.lower():
             return HTTPStatus.FORBIDDEN, {}, "This request comes from another website.\n"
@@ -128,7 +134,8 @@ class Gate:
         cookie = re.sub(r"[^A-Za-z0-9_]", "", cookie)
         with contextlib.suppress(CookieError):
             found = SimpleCookie(headers.get("Cookie", "")).get(cookie)
-            if found is not None and hmac.compare_digest(found.value, self.token):
+            value = "" if found is None else found.value
+            if hmac.compare_digest(value.encode(), self.token.encode()):
                 return None
         shown = parse_qs(urlsplit(target).query).get("token", [""])[-1]
         if hmac.compare_digest(shown.encode(), self.token.encode()):
@@ -173,7 +180,6 @@ def serve_page(options: PageOptions, label: str) -> Iterator[tuple[viser.ViserSe
     # It tells of every connection, and of the request that `_require_guarded` makes.
     logging.getLogger("websockets").setLevel(logging.WARNING)
     _require_free(options)
-    logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor
     gate = Gate(options.host, options.secret)
     with _guarded(gate), contextlib.redirect_stdout(io.StringIO()):  # viser prints its address
         server = Server(options.host, options.port, label, verbose=False)

@@ -27,7 +27,12 @@ from typing import Any, NoReturn, TypeVar, cast
 
 import tyro
 
-from robo_manip_baselines.runs.errors import RequestError, WriteError, disk_problem
+from robo_manip_baselines.runs.errors import (
+    RequestError,
+    WriteError,
+    disk_problem,
+    path_problem,
+)
 from robo_manip_baselines.runs.interrupt import signals_as_interrupt
 from robo_manip_baselines.runs.ranges import require_ranges
 
@@ -82,8 +87,9 @@ def run_command(
 ) -> NoReturn:
     """Run ``main`` and end the process with the matching exit code.
 
-    A `RequestError` becomes one line on stderr, without a traceback; so does any other exception,
-    whose traceback goes to a file that the line names.
+    A `RequestError` becomes one line on stderr, without a traceback; so does a path that cannot be
+    used, as one with a name that is too long; so does any other exception, whose traceback goes to
+    a file that the line names.
 
     Args:
         main: the command; returns the exit code, None being 0.
@@ -115,6 +121,8 @@ def run_command(
     except Exception as error:
         if problem := explain and explain(error):
             code = _say(f"error: {problem}", EXIT_WRONG_REQUEST)
+        elif problem := path_problem(error):
+            code = _say(f"error: {_one_line(problem)}", EXIT_WRONG_REQUEST)
         elif reason := disk_problem(error):
             file = getattr(error, "filename", None)
             what = f"read or write '{_text(file)}'" if file else "write the output"

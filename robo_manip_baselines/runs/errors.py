@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from typing import Any
 
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+_PATH = {errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES}
 _NUMBER = re.compile(r"(?:\[Errno |errno = |os error )(\d+)")  # HDF5 and safetensors say it in text
 
 
@@ -40,6 +41,13 @@ def disk_problem(error: BaseException) -> str | None:
             return os.strerror(number)
         cause = cause.__cause__ or cause.__context__
     return None
+
+
+def path_problem(error: BaseException) -> str | None:
+    """Reason for which a path cannot be used, with the path, if that is the error; else None."""
+    if not isinstance(error, OSError) or error.errno not in _PATH or error.filename is None:
+        return None
+    return f"'{os.fsdecode(error.filename)}': {os.strerror(error.errno)}; name another path"
 
 
 def require_choice(what: str, given: str, valid: Iterable[str]) -> str:

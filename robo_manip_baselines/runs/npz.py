@@ -6,7 +6,6 @@ type, shape and size are compared with the table before any of its data are read
 
 from __future__ import annotations
 
-import hashlib
 import re
 import struct
 import zipfile
@@ -171,14 +170,6 @@ def read_json_array(arrays: Arrays, key: str, name: str | Path) -> dict[str, Any
     """
     source = f"{name}: '{key}'"
     return convert(parse_json(str(arrays[key]), source), dict, source)
-
-
-def arrays_digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """Return the SHA-256 of names, types, shapes and numbers, in the given order."""
-    digest = hashlib.sha256()
-    for name, array in arrays.items():
-        add_array(digest, name, array)
-    return digest.hexdigest()
 
 
 def add_array(digest: Any, name: str, array: np.ndarray) -> None:

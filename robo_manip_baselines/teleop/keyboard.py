@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from robo_manip_baselines.envs.mujoco.cell.opengl import viewer_problem
+from robo_manip_baselines.envs.mujoco.cell.rendering import MODEL_CHANGES
 from robo_manip_baselines.envs.mujoco.cell.window import ViewerWindow
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.runs.errors import RequestError
@@ -139,7 +140,8 @@ class KeyboardDevice:
         actions = list(self._actions())
         asked = self.hand.update(view, actions, self._steering.key_step, self._steering.speed)
         mujoco.mj_copyData(self._data, self._model, view.world.data)
-        self._model.site_rgba[:] = view.world.model.site_rgba
+        for name in MODEL_CHANGES:
+            getattr(self._model, name)[:] = getattr(view.world.model, name)
         if self._steps % STATUS_STEPS == 0:
             self._viewer.set_texts(self._texts(view))
         self._viewer.sync()

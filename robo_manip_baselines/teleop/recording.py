@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -179,19 +178,3 @@ def draw_images(path: Path, out: Path) -> Path:
     write_episode(target, arrays, images, given)
     path.unlink()
     return target
-
-
-def free_seeds(out: Path, first: int, count: int, taken: set[int]) -> Sequence[int]:
-    """Return the seeds from ``first`` on, as many as asked for, that have no episode yet.
-
-    Raises:
-        RequestError: all of them have.
-    """
-    wanted = range(first, first + count)
-    seeds = [seed for seed in wanted if seed not in taken]
-    if not seeds:
-        raise RequestError(
-            f"'{out}' holds all episodes of the seeds {first} to {wanted[-1]}; give another "
-            "--seed or more --num_episodes"
-        )
-    return seeds

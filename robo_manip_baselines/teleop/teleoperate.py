@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +12,7 @@ from typing import Annotated, Any
 from annotated_types import Interval
 
 from robo_manip_baselines.data import EpisodeReader, list_episodes
+from robo_manip_baselines.data.demonstrations import SHOWN
 from robo_manip_baselines.data.files import UNRENDERED_FOLDER
 from robo_manip_baselines.data.schema import TELEOP
 from robo_manip_baselines.envs.mujoco.cell.opengl import opengl_problem, viewer_problem
@@ -37,7 +38,7 @@ from robo_manip_baselines.runs.images import CODECS, DEFAULT_QUALITY
 from robo_manip_baselines.runs.ranges import Episodes, Quality, Seed, require_ranges
 from robo_manip_baselines.teleop.device import DEVICES, TeleopDevice, make_device
 from robo_manip_baselines.teleop.options import SteeringOptions
-from robo_manip_baselines.teleop.recording import EpisodeStore, free_seeds
+from robo_manip_baselines.teleop.recording import EpisodeStore
 from robo_manip_baselines.teleop.replay import ReplayDevice
 from robo_manip_baselines.teleop.session import SessionSummary, TeleopSession
 from robo_manip_baselines.teleop.shared import CheckpointPolicy, read_shared
@@ -229,7 +230,7 @@ def _episode_paths(config: TeleopConfig) -> list[Path]:
     return paths[: config.num_episodes]
 
 
-_DRAWING = ("cameras", "image_size", "render_size", "shadows", "multisamples", "obs", "horizon")
+_LOOKS = SHOWN | {"shadows", "multisamples", "render_mode"}
 """Arguments of the environment that say nothing of how the world goes on."""
 
 
@@ -242,12 +243,12 @@ def _require_same_world(path: Path, config: TeleopConfig, kwargs: Mapping[str, A
     with EpisodeReader(path) as episode:
         known = episode.attributes
     worlds = [
-        {k: v for k, v in without_library_path(item).items() if k not in _DRAWING}
+        {k: v for k, v in without_library_path(item).items() if k not in _LOOKS}
         for item in ({"face_motion": "episode", **known["env_kwargs"]}, kwargs)
     ]
     if known["env_id"] != config.task.env_id:
         raise RequestError(f"'{path}' is of {known['env_id']}, not of {config.env}")
-    for name in sorted({*worlds[0], *worlds[1]} - {"arms"}):
+    for name in sorted({*worlds[0], *worlds[1]}):
         recorded, ours = (json.dumps(world.get(name)) for world in worlds)
         if recorded != ours:
             raise RequestError(
@@ -257,14 +258,20 @@ def _require_same_world(path: Path, config: TeleopConfig, kwargs: Mapping[str, A
 
 
 def _seeds(config: TeleopConfig, device: TeleopDevice, store: EpisodeStore) -> list[int]:
-    """Return the seeds that are still to be recorded.
+    """Return the seeds that are still to be recorded; none where only images are left to draw.
 
     Raises:
-        RequestError: there is none.
+        RequestError: there is nothing left to do.
     """
+    wanted: Sequence[int] = range(config.first_seed, config.first_seed + config.num_episodes)
+    problem = (
+        f"holds all episodes of the seeds {wanted[0]} to {wanted[-1]}; give another --seed or more "
+        "--num_episodes"
+    )
     if isinstance(device, ReplayDevice):
-        seeds = [seed for seed in device.seeds if seed not in store.seeds]
-        if not seeds and not store.waiting:
-            raise RequestError(f"'{config.out}' holds an episode of every seed played back")
-        return seeds
-    return list(free_seeds(config.out, config.first_seed, config.num_episodes, store.seeds))
+        wanted, problem = device.seeds, "holds an episode of every seed played back"
+    taken = store.seeds
+    seeds = [seed for seed in wanted if seed not in taken]
+    if not seeds and not store.waiting:
+        raise RequestError(f"'{config.out}' {problem}")
+    return seeds

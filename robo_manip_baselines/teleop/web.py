@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
+from robo_manip_baselines.envs.mujoco.cell.rendering import MODEL_CHANGES, CameraRenderer
 from robo_manip_baselines.envs.mujoco.cell.viser_scene import ViserScene
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
 from robo_manip_baselines.runs.browser import PageOptions, require_viser, serve_page
@@ -125,7 +125,7 @@ class WebDevice:
         self._server, self.address = self._closing.enter_context(
             serve_page(page or PageOptions(), label)
         )
-        self._cameras = _Previews(world.model, cameras) if cameras else None
+        self._cameras = Previews(world.model, cameras) if cameras else None
         if self._cameras:
             self._closing.callback(self._cameras.close)
         self._steps = 0
@@ -328,7 +328,7 @@ def _key_name(key: str) -> str:
 # -- camera images --------------------------------------------------------------------------------
 
 
-class _Previews:
+class Previews:
     """Images of cameras, drawn in a process of its own whenever the last ones have been shown."""
 
     def __init__(self, model: mujoco.MjModel, cameras: Sequence[str]) -> None:
@@ -342,9 +342,9 @@ class _Previews:
             if not wait_for([self._worker], 0.0):
                 return None
             images = self._worker.receive()
-        data = world.data
+        data, model = world.data, world.model
         state = (data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy())
-        self._worker.submit((*state, world.model.site_rgba.copy()))
+        self._worker.submit((state, [getattr(model, name).copy() for name in MODEL_CHANGES]))
         self._is_drawing = True
         return images
 
@@ -361,9 +361,13 @@ class _PreviewDrawer:
         self._renderer = CameraRenderer(model, *PREVIEW_SIZE)
         self.close = self._renderer.close
 
-    def __call__(self, state: tuple[NDArray[Any], ...]) -> dict[str, bytes]:
+    def __call__(
+        self, given: tuple[tuple[NDArray[Any], ...], list[NDArray[Any]]]
+    ) -> dict[str, bytes]:
         data = self._data
-        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:], self._model.site_rgba[:] = state
+        (data.qpos[:], data.mocap_pos[:], data.mocap_quat[:]), changes = given
+        for name, values in zip(MODEL_CHANGES, changes, strict=True):
+            getattr(self._model, name)[:] = values
         mujoco.mj_kinematics(self._model, data)
         mujoco.mj_camlight(self._model, data)
         images = self._renderer.render(data, self._names)

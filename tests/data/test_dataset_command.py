@@ -126,6 +126,7 @@ def test_plot_refuses_what_it_cannot_draw_or_write(folder: Path, tmp_path: Path)
     missing, episode = tmp_path / "none.hdf5", episode_path(folder, 1, True)
     for arguments, message in (
         ((missing,), f"error: '{missing}' "),
+        ((".",), "error: '.' is no file"),
         ((episode, "--out", tmp_path / "a.gif"), "error: unknown --out: image of type '.gif'"),
     ):
         done = dataset("plot", *arguments)

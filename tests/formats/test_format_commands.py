@@ -51,6 +51,8 @@ def test_lerobot(one_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     [
         (["--format", "hdf"], "unknown format 'hdf'; valid: aloha, lerobot, rmb"),
         (["--format", "rmb", "--obs", "current"], "--obs: not for the format rmb"),
+        (["--format", "rmb", "--error", "uniform"], "--error: not for the format rmb"),
+        (["--format", "aloha", "--no_recorded"], "--no_recorded: not for the format aloha"),
         (["--format", "aloha", "--crf", "3"], "--crf: not for the format aloha"),
         (["--format", "lerobot", "--video_codec", "vp9"], "unknown video codec 'vp9'"),
         (["--format", "lerobot", "--obs", "baseline", "--error", "uniform"], "shows nothing"),

@@ -160,6 +160,12 @@ def run(body: str) -> subprocess.CompletedProcess[str]:
         ("return 1", 1, "", ""),
         ("raise SystemExit(3)", 3, "", ""),
         ("raise RequestError('no camera\\n  \"tpo\"')", 2, "", 'error: no camera "tpo"\n'),
+        (
+            "open('a' * 300)",
+            2,
+            "",
+            f"error: '{'a' * 300}': File name too long; name another path\n",
+        ),
         ("raise KeyboardInterrupt", 130, "", "interrupted\n"),
         ("logging.getLogger('x').info('hello')", 0, "", "hello\n"),
     ],

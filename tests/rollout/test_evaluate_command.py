@@ -38,7 +38,7 @@ from robo_manip_baselines.rollout.evaluation import (
     evaluate,
     run_name,
 )
-from robo_manip_baselines.rollout.results import read_results
+from robo_manip_baselines.rollout.results import open_results, read_results
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import locked
 from robo_manip_baselines.runs.npz import write_npz
@@ -95,6 +95,23 @@ def test_evaluates_and_carries_on(
     capsys.readouterr()
     main(command_line(run_folder, out=pieces))
     assert re.search(r"^speed +-$", capsys.readouterr().out, re.M)
+
+
+def test_what_a_killed_run_left_is_removed(run_folder: Path, tmp_path: Path) -> None:
+    gone = 2**22 + 1  # no process has such a number
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    left = [
+        tmp_path / f".results.jsonl.{gone}.partial",
+        videos / f".seed_001000.mp4.{gone}.partial",
+    ]
+    for path in left:
+        path.touch()
+    settings = EvaluationPlan.of(config(run_folder, out=tmp_path)).settings
+    with open_results(tmp_path, settings, {}):
+        pass
+    evaluate(config(run_folder, "--num_episodes 1", out=tmp_path))
+    assert not [path for path in left if path.exists()]
 
 
 def test_the_summary_is_of_the_whole_folder(run_folder: Path, tmp_path: Path) -> None:

@@ -135,7 +135,12 @@ def test_what_cannot_be_tiled_is_one_line(folder: Path, tmp_path: Path) -> None:
     evaluate(tmp_path / "fast", "low", {1005: 3}, fps=50.0)
     with pytest.raises(RequestError, match=r"has 50 frames/s .* 25 and .*; evaluate them alike"):
         write_tiles(tmp_path / "tiles.mp4", find_tiles([folder / "b", tmp_path / "fast"], 9))
-    next((folder / "a" / "videos").glob("*1000*")).write_bytes(b"no video")
+    video = next((folder / "a" / "videos").glob("*1000*"))
+    whole = video.read_bytes()
+    video.write_bytes(whole[: len(whole) - 40])  # of the last frames: the index is at the front
+    with pytest.raises(RequestError, match="is damaged: "):
+        write_tiles(tmp_path / "tiles.mp4", find_tiles([folder], 1))
+    video.write_bytes(b"no video")
     with pytest.raises(RequestError, match="is no video"):
         write_tiles(tmp_path / "tiles.mp4", find_tiles([folder], 1))
     assert not list(tmp_path.glob("*.mp4"))

@@ -72,6 +72,22 @@ def test_a_token_opens_and_a_cookie_remembers_it() -> None:
     assert GUARDED.refusal("/", elsewhere) is not None
 
 
+@pytest.mark.parametrize(
+    ("gate", "target", "headers"),
+    [
+        (OPEN, "/", {"Host": "["}),
+        (OPEN, "/", {"Host": "127.0.0.1", "Origin": "http://["}),
+        (GUARDED, "//[", {"Host": "robot.local"}),
+        (GUARDED, "/?token=\udcff", {"Host": "robot.local"}),  # a byte that is no text
+        (GUARDED, "/", {"Host": "robot.local:80", "Cookie": 'rmb_token_80="\\303\\251"'}),
+    ],
+)
+def test_malformed_requests_are_refused(gate: Gate, target: str, headers: dict[str, str]) -> None:
+    answer = gate.refusal(target, headers)
+    assert answer is not None
+    assert answer[0] in (400, 403)
+
+
 def test_a_missing_library_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("robo_manip_baselines.runs.browser.find_spec", lambda _: None)
     with pytest.raises(RequestError, match=r"needs viser, which is not installed: .*pip install"):

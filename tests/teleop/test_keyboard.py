@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from ctypes.util import find_library
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from robo_manip_baselines.data.files import list_failures
 from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.envs.mujoco.expert.phases import DOWN
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
+from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.teleop import keyboard, teleoperate
 from robo_manip_baselines.teleop.device import Mode, SessionView, TeleopEvent, TeleopInput
@@ -136,6 +138,22 @@ def test_the_window_shows_the_state_and_the_keys(update: Update, windows: Window
         assert (one + other).isascii()
     alone = keyboard.key_rows(("right",), has_policy=False)
     assert not {"take over", "give back", "switch arm"} & {label for _, label in alone}
+
+
+def test_the_window_shows_what_a_task_changes_in_its_model(
+    windows: Windows, view: SessionView
+) -> None:
+    """Liquid in a cup: the window draws a copy of the model, made before the episode."""
+    with closing(make_env("DrinkingEnv", cameras=())) as env:
+        world = world_of(env)
+        device = KeyboardDevice(world, ("right",))
+        env.reset(seed=0)
+        device.update(replace(view, world=world))
+        liquid = world.model.geom("cup/slice_5").id
+        np.testing.assert_array_equal(
+            windows[0].model.geom_size[liquid], world.model.geom_size[liquid]
+        )
+        assert windows[0].model.geom_size[liquid, 2] > 0.001
 
 
 def test_an_episode_is_recorded_whatever_happens_in_the_window(

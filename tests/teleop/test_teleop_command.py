@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from robo_manip_baselines.data.verify import verify_dataset
 from robo_manip_baselines.observation import ObservationSpec
 from robo_manip_baselines.rollout.demonstrate import Collection, collect, deviation
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.teleop import recording
+from robo_manip_baselines.teleop import recording, teleoperate
 
 pytestmark = pytest.mark.long
 
@@ -101,6 +102,28 @@ def test_a_session_draws_what_a_killed_one_left(recorded: Recorded, tmp_path: Pa
 
 
 @pytest.mark.gl
+def test_the_same_command_draws_what_is_left_where_every_seed_is_recorded(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """Of devices that a person moves: nobody is asked to, and the session ends."""
+    out, size = tmp_path / "out", ("--cameras", "top", "--image_size", "24x32")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording.EpisodeStore, "poll", lambda store: "")
+        patch.setattr(recording.EpisodeStore, "finish", lambda store: None)
+        play_back(recorded(), out, *size)
+    again = ["FeedingEnv", "--device", "web", "--num_episodes", "1", "--out", str(out), *size]
+    device = SimpleNamespace(is_paced=False, close=lambda: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(teleoperate, "open_device", lambda *_: device)
+        teleop.main(again)
+        (path,) = list_episodes(out)
+        with EpisodeReader(path) as episode:
+            assert episode.cameras == ("top",)
+        with pytest.raises(RequestError, match="holds all episodes of the seeds 0 to 0; give"):
+            teleop.main(again)
+
+
+@pytest.mark.gl
 def test_actions_that_lead_elsewhere_are_noticed(recorded: Recorded, tmp_path: Path) -> None:
     with EpisodeReader(list_episodes(recorded())[0]) as episode:
         derived = {item.name for item in episode.schema.attributes if item.is_derived}
@@ -126,6 +149,8 @@ def test_actions_that_lead_elsewhere_are_noticed(recorded: Recorded, tmp_path: P
         (["--image_codec", "gif"], "unknown image codec 'gif'"),
         (["--motion", "flying"], "flying"),
         (["--episodes", "there", "--arm", "left"], "there"),
+        (["--port", "9"], "--port goes with --device web or spacemouse, not with replay"),
+        (["--device", "web", "--mice", "/dev/hidraw3"], "--mice goes with --device keyboard or sp"),
     ],
 )
 def test_what_is_wrong_is_one_line(options: list[str], message: str, tmp_path: Path) -> None:
@@ -160,6 +185,21 @@ def test_folders_of_other_settings_are_refused(recorded: Recorded, tmp_path: Pat
 def test_the_world_must_be_the_recorded_one(recorded: Recorded, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match='was recorded with motion null, not "still"'):
         play_back(recorded(), tmp_path / "out", "--cameras", "none", "--motion", "still")
+
+
+def test_what_an_expert_was_shown_is_no_part_of_the_world(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """As by a servo that goes by a camera; the command has no such options."""
+    with EpisodeReader(list_episodes(recorded())[0]) as episode:
+        derived = {item.name for item in episode.schema.attributes if item.is_derived}
+        known = {k: v for k, v in episode.attributes.items() if k not in derived}
+        arrays = dict(episode.arrays)
+    shown = {"mouth_source": "camera", "camera_latency": 2, "render_mode": "rgb_array"}
+    known["env_kwargs"] = known["env_kwargs"] | shown
+    recording.write_episode(tmp_path / "camera" / "episode_000000.hdf5", arrays, {}, known)
+    play_back(tmp_path / "camera", tmp_path / "out")
+    assert len(list_episodes(tmp_path / "out")) == 1
 
 
 def test_the_left_arm_alone(recorded: Recorded, tmp_path: Path) -> None:

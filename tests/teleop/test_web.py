@@ -19,11 +19,13 @@ import pytest
 from robo_manip_baselines.data import EpisodeReader
 from robo_manip_baselines.data.files import list_failures
 from robo_manip_baselines.data.verify import verify_dataset
+from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
 from robo_manip_baselines.envs.mujoco.expert.phases import DOWN
 from robo_manip_baselines.envs.mujoco.tasks.face_env import world_of
 from robo_manip_baselines.envs.mujoco.tasks.registry import make_env
 from robo_manip_baselines.runs.browser import PageOptions
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.images import encode_image
 from robo_manip_baselines.teleop.arms import SteeredArms
 from robo_manip_baselines.teleop.device import (
     ArmPose,
@@ -43,7 +45,15 @@ from robo_manip_baselines.teleop.hand import (
     Key,
     Opening,
 )
-from robo_manip_baselines.teleop.web import EVENTS, HANDLE_SIZE, key_map, status_html
+from robo_manip_baselines.teleop.web import (
+    EVENTS,
+    HANDLE_SIZE,
+    PREVIEW_QUALITY,
+    PREVIEW_SIZE,
+    Previews,
+    key_map,
+    status_html,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 START = ArmPose(np.array([0.2, 0.5, 0.3]), np.array([0.0, 0.0, 0.0, 1.0]), 1.0)
@@ -137,6 +147,23 @@ def test_the_status_shows_the_session(view: SessionView) -> None:
     assert shown["gripper"] == "0.200 0.500 0.300"
     assert shown["message"] == "&lt;recording&gt;"
     assert "acting" not in status_html(view)
+
+
+@pytest.mark.gl
+def test_previews_show_what_a_task_changes_in_its_model() -> None:
+    """Residue on a cheek, whose place is drawn with the episode, after the page has opened."""
+    with (
+        closing(make_env("FaceWipingEnv", cameras=())) as env,
+        closing(Previews(world_of(env).model, ("front_close",))) as previews,
+    ):
+        env.reset(seed=0)
+        world, images = world_of(env), None
+        while images is None:
+            images = previews.exchange(world)
+            time.sleep(0.02)
+        with CameraRenderer(world.model, *PREVIEW_SIZE) as renderer:
+            wanted = renderer.render(world.data, ["front_close"])["front_close"]
+    assert images["front_close"] == encode_image(wanted, "jpeg", PREVIEW_QUALITY).tobytes()
 
 
 def test_another_address_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:

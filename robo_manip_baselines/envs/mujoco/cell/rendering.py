@@ -39,6 +39,13 @@ _MAX_GEOMS: Final = 2000
 MAX_MULTISAMPLES: Final = 64
 """Most samples per pixel that are accepted; drivers offer 4 to 32, and use what they have."""
 
+MODEL_CHANGES: Final = (
+    *("geom_pos", "geom_size"),  # of liquid
+    *("site_pos", "site_quat", "site_rgba", "site_sameframe"),  # of residue
+)
+"""Arrays of a model that a task changes in an episode to show something; a copy of the model that
+is drawn needs them, too."""
+
 _open_renderers: weakref.WeakSet[CameraRenderer] = weakref.WeakSet()
 
 

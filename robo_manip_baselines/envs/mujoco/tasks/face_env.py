@@ -239,6 +239,12 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         """Return the present values of the fields that the task adds to episode files."""
         return {}
 
+    def show_row(self, row: Mapping[str, NDArray[Any]]) -> None:
+        """Let what is drawn, beyond the simulator's state, be as in a recorded row of `task_row`.
+
+        The bodies are where they were then; the next kinematics place what is drawn.
+        """
+
     def target_track(self) -> Floats:
         """(K, 3) m, world: the true target now and 1 ... 24 frames ahead; the mouth by default."""
         return self.mouth_track

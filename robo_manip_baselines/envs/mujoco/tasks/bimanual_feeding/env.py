@@ -97,6 +97,7 @@ class BimanualFeedingEnv(FeedingEnv):
     | name | default | meaning |
     |---|---|---|
     | ``arms`` | ``"both"`` | both; ``"right"`` is refused |
+    | ``utensil`` | ``"gripper"`` | gripper; ``"spoon"`` is refused |
 
     Raises ``RequestError``, a ``ValueError``, when an argument, a seed (0 to 2⁵³ - 1) or an option
     of ``reset`` (there are none) is not valid.

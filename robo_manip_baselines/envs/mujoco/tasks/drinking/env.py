@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -17,6 +18,7 @@ from robo_manip_baselines.envs.mujoco.tasks.drinking.cup import (
     add_cup,
 )
 from robo_manip_baselines.envs.mujoco.tasks.drinking.liquid import (
+    SERVING,
     Liquid,
     jet_at,
     outflow_speed,
@@ -165,13 +167,15 @@ class DrinkingEnv(FaceEnv):
     mouth in images of ``front_close`` (needs the extra ``face_prediction`` and OpenGL) |
     | ``camera_latency`` | 1 | frames of 1/30 s from an image to its report, or ``"measured"`` |
     | ``arms`` | ``"right"`` | right or both |
+    | ``face`` | ``"visual"`` | kind of face: visual, or physical, soft tissue on a head that
+    yields |
     | ``face_motion`` | ``"episode"`` | episode or after_lift |
     | ``motion`` | ``"recorded"`` | of the face by name: recorded, still, nod, turn, sway, tremor,
     dyskinetic, spasm, turn_away, chew, with parameters and as sums, see ``parse_motion`` |
     | ``people`` | ``"all"`` | all, or train or test: different people, drawn before their starts |
     | ``clips`` | None | ids of recorded clips to draw from; all if None |
-    | ``motion_library`` | None | a file of ``face_prediction export-motion``; the shipped one if
-    None |
+    | ``motion_library`` | None | a file of ``face_prediction export-motion``, or ``"extended"``,
+    the shipped one with more people; the shipped one of recordings alone if None |
     | ``motion_sha256`` | None | digest of the library's motion; any if None |
     | ``shadows``, ``multisamples`` | False, 0 | prettier and slower images, for videos |
     | ``render_mode`` | None | ``"rgb_array"``: ``render()`` gives the camera ``angle``;
@@ -279,6 +283,11 @@ class DrinkingEnv(FaceEnv):
         liquid = self.liquid
         shares = np.array([liquid.delivered_share, liquid.spilled_share])
         return {"object_pose": self.object_pose, "liquid": shares}
+
+    def show_row(self, row: Mapping[str, NDArray[Any]]) -> None:
+        """Show the liquid that was left, without a jet."""
+        left, up = SERVING * max(1.0 - float(row["liquid"].sum()), 0.0), self.cup_axes[2]
+        self._view.show(self.model, surface_height(left, up), up, NO_DROPS)
 
     def start_attributes(self) -> dict[str, Any]:
         """Return what `FaceEnv` does, and the cup's start."""

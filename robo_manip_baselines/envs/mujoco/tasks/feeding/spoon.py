@@ -19,9 +19,6 @@ from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD, FACE, MO
 
 Floats = NDArray[np.float64]
 
-UTENSILS: Final = ("gripper", "spoon")
-"""Tools that bring the food to the mouth."""
-
 SPOON: Final = "spoon"
 """Body of the spoon, what touches a face with it, and the site in its bowl."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -93,7 +94,7 @@ class FaceWipingEnv(FaceEnv):
 
     ## Arguments
 
-    Those of `FeedingEnv`, without ``object_pose``.
+    Those of `FeedingEnv`, without ``object_pose`` and ``utensil``.
 
     ## Version history
 
@@ -219,3 +220,7 @@ class FaceWipingEnv(FaceEnv):
         residue = np.ones(SPOTS, np.int8)
         residue[list(self.progress.wiped)] = 0
         return {"pad_force": self.pad_force, "residue": residue}
+
+    def show_row(self, row: Mapping[str, NDArray[Any]]) -> None:
+        """Show the spots that were left."""
+        self._sites.show(self.model, row["residue"])

@@ -245,3 +245,7 @@ class ResidueSites:
     def hide(self, model: mujoco.MjModel, spots: frozenset[int]) -> None:
         """Show some spots no more."""
         model.site_rgba[self._sites[list(spots)], 3] = 0.0
+
+    def show(self, model: mujoco.MjModel, is_there: ArrayLike) -> None:
+        """Show the spots, (S,), that are there, and no others."""
+        model.site_rgba[self._sites, 3] = is_there
