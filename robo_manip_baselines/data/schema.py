@@ -70,7 +70,7 @@ SYMBOLS: Mapping[str, str] = {
     "Q": "simulator positions (`model.nq`)",
     "V": "simulator velocities (`model.nv`)",
     "K": "frames of the truth, from now on: 25; in files of versions 1 and 2, 6",
-    "H": "frames of the forecast: 1 to 24, as many as the motion library holds; the shipped one, 5",
+    "H": "frames of the forecast: 1 to 24, as many as the motion library has; the shipped one 24",
     "R": "regions of the face: forehead, eyes, nose, cheeks, lips, chin, tongue, teeth, mouth (its "
     "other walls inside), head (sides and back), neck (with the bust)",
     "B": "what touches it: gripper, arm, anything else, then the objects of the task in order, and "

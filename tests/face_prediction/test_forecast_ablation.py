@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from face_prediction.evaluation.tracks import GROUPS
+from face_prediction.evaluation.tracks import TRACK_GROUPS
 from face_prediction.models.residual.predictor import ResidualPredictor
 from robo_manip_baselines.runs.errors import RequestError
 
@@ -38,7 +38,7 @@ def ablation(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     def score(error: float, stretches: list[Any], settings: object, names: list[str]):
         for name in names:
             module.scored.append((error, name))
-            counts = {"sums": [error + (name != "nothing")] * len(GROUPS)}
+            counts = {"sums": [error + (name != "nothing")] * len(TRACK_GROUPS)}
             yield name, [{"subject": "ann", "kind": "natural", **counts}]
 
     dataset = SimpleNamespace(manifest=SimpleNamespace(settings=None))
@@ -82,7 +82,7 @@ def test_other_weights_and_lines_without_a_digest_are_done_again(
     ablation: ModuleType, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     folder, out = weights(tmp_path / "fold0", 1.0), tmp_path / "out.jsonl"
-    track = {"subject": "ann", "kind": "natural", "sums": [9.0] * len(GROUPS)}
+    track = {"subject": "ann", "kind": "natural", "sums": [9.0] * len(TRACK_GROUPS)}
     earlier = {"without": "nothing", "fold": 0, "most_frames": 400, "tracks": [track]}
     out.write_text(json.dumps(earlier) + "\n")
     run(ablation, monkeypatch, out, folder)
