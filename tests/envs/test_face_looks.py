@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -97,15 +96,8 @@ def test_eyes_lips_skin_and_mouth_differ_by_colour(portrait) -> None:
 
 
 @pytest.fixture(scope="module")
-def benchmark(repository: Path) -> ModuleType:
-    file = repository / "benchmarks/face_detection.py"
-    spec = importlib.util.spec_from_file_location("face_detection", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["face_detection"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+def benchmark(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script("benchmarks/face_detection.py")
 
 
 @pytest.mark.gl

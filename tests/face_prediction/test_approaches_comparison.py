@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -19,15 +18,11 @@ from robo_manip_baselines.runs.files import file_digest, write_json
 
 
 @pytest.fixture
-def approaches(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def approaches(
+    load_script: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> ModuleType:
     """The script, with trainings and evaluations that write their files at once."""
-    path = repository / "benchmarks/approaches.py"
-    spec = importlib.util.spec_from_file_location("approaches", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "approaches", module)
-    spec.loader.exec_module(module)
+    module = load_script("benchmarks/approaches.py")
     module.trained, module.evaluated = [], []
 
     def run_train(options: FaceTrainOptions) -> int:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -19,14 +19,11 @@ from robo_manip_baselines.runs.errors import RequestError
 
 
 @pytest.fixture
-def ablation(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def ablation(
+    load_script: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> ModuleType:
     """The script, with folders of text as weights: the error of the whole."""
-    path = repository / "benchmarks/forecast_ablation.py"
-    spec = importlib.util.spec_from_file_location("forecast_ablation", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_script("benchmarks/forecast_ablation.py")
     module.scored = []
 
     def load_predictor(folder: Path) -> tuple[Any, Any]:

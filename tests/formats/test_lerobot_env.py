@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from importlib.util import module_from_spec, spec_from_file_location
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -22,13 +23,8 @@ NAME = "lerobot_env_robo_manip_baselines"
 
 
 @pytest.fixture(scope="module")
-def view(repository: Path) -> Any:
-    path = repository / "integrations" / NAME / NAME / "view.py"
-    spec = spec_from_file_location("lerobot_view", path)
-    assert spec
-    assert spec.loader
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
+def view(load_script: Callable[[str], ModuleType]) -> Any:
+    module = load_script(f"integrations/{NAME}/{NAME}/view.py")
     return module.LeRobotView
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -10,14 +10,8 @@ import pytest
 
 
 @pytest.fixture(scope="module")
-def documentation(repository: Path) -> ModuleType:
-    file = repository / ".ci" / "documentation.py"
-    spec = importlib.util.spec_from_file_location("documentation", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def documentation(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script(".ci/documentation.py")
 
 
 def test_sections_are_bold_lines_and_pages_their_links(documentation: ModuleType) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -164,13 +164,8 @@ def test_help_lists_the_targets(repository: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def wheelhouse(repository: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("wheelhouse", repository / ".ci/wheelhouse.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def wheelhouse(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script(".ci/wheelhouse.py")
 
 
 def test_wheelhouse_pins_are_those_of_the_other_python(wheelhouse: ModuleType) -> None:

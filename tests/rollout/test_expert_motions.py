@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -14,16 +13,11 @@ from robo_manip_baselines.envs.mujoco.tasks.registry import task_names
 
 
 @pytest.fixture
-def module(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def module(
+    load_script: Callable[[str], ModuleType], repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> ModuleType:
     monkeypatch.syspath_prepend(str(repository / "benchmarks"))
-    path = repository / "benchmarks/expert_motions.py"
-    spec = importlib.util.spec_from_file_location("expert_motions", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "expert_motions", module)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("benchmarks/expert_motions.py")
 
 
 def test_a_table_is_continued_row_by_row(

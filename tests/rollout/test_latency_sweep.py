@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from collections.abc import Callable
@@ -16,14 +15,8 @@ from robo_manip_baselines.rollout.results import Proportion, read_results
 
 
 @pytest.fixture(scope="module")
-def latency(repository: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("latency", repository / "benchmarks/latency.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where a dataclass looks up its annotations
-    spec.loader.exec_module(module)
-    return module
+def latency(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script("benchmarks/latency.py")
 
 
 def test_every_combination_has_a_folder(latency: ModuleType) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import ModuleType
@@ -26,14 +25,8 @@ SEED = {"first_seed": 1000}
 
 
 @pytest.fixture(scope="module")
-def policies(repository: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("policies", repository / "benchmarks/policies.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where a dataclass looks up its annotations
-    spec.loader.exec_module(module)
-    return module
+def policies(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script("benchmarks/policies.py")
 
 
 def result(policy: str, train_seed: int, seed: int, *, is_success: bool) -> EpisodeResult:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shlex
 import shutil
-import sys
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from types import ModuleType
@@ -36,16 +35,9 @@ NAMES = ("baseline", "current", "forecast")
 
 
 @pytest.fixture(scope="module")
-def maker(repository: Path) -> ModuleType:
+def maker(load_script: Callable[[str], ModuleType]) -> ModuleType:
     """The command that made them."""
-    path = repository / "benchmarks/shipped_checkpoints.py"
-    spec = importlib.util.spec_from_file_location("shipped_checkpoints", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where a dataclass looks up its annotations
-    spec.loader.exec_module(module)
-    return module
+    return load_script("benchmarks/shipped_checkpoints.py")
 
 
 def test_their_names() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,15 +22,10 @@ TINY = ("width=16", "heads=2", "layers=1", "feedforward=16", "history=6", "horiz
 
 
 @pytest.fixture
-def approaches(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    path = repository / "benchmarks/approaches.py"
-    spec = importlib.util.spec_from_file_location("approaches", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "approaches", module)
-    spec.loader.exec_module(module)
-    return module
+def approaches(
+    load_script: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> ModuleType:
+    return load_script("benchmarks/approaches.py")
 
 
 def test_an_interrupted_training_is_finished_and_other_settings_are_refused(
