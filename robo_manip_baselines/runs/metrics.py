@@ -240,8 +240,10 @@ def write_curves(
         return False
     if panels is None:
         other = ("kind", "step", "epoch", "learning_rate", "grad_norm", "seconds")
-        # A policy whose loss has one part calls it twice.
+        # A part that is 0 throughout is not drawn: the network has none of it.
         parts = [n for n in train[-1] if n not in other and not n.startswith("seconds_")]
+        parts = [n for n in parts if n == "loss" or any(line.get(n) for line in train)]
+        # A policy whose loss has one part calls it twice.
         if len(parts) == 2 and all(line[parts[0]] == line.get(parts[1]) for line in train):
             parts.pop()
         panels = {name: (name,) for name in parts}
