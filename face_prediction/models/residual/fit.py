@@ -349,10 +349,10 @@ def mix_again(
             mouth = [tracks[number][:, :2] for number in alive]
             mixture.learn(np.stack([track[frame] - track[frame - ages] for track in mouth]))
         experts = np.stack([made[number][frame] for number in alive])
-        forecast, features = mixture.mix(experts, seen)
+        forecast, of_frame = mixture.mix(experts, seen)
         mixture.remember(forecast, experts)
         for place, number in enumerate(alive):
-            moved[number][frame], signs[number][frame] = forecast[place], features[place]
+            moved[number][frame], signs[number][frame] = forecast[place], of_frame[place]
     errors = [missed(own, track) for own, track in zip(moved, tracks, strict=True)]
     return np.concatenate(signs), np.concatenate(errors)
 
