@@ -27,7 +27,11 @@ from robo_manip_baselines.observation.spec import ImageSize
 from robo_manip_baselines.policy.checkpoint import ACTING_FILES, read_checkpoint
 from robo_manip_baselines.policy.presets import TrainSettings
 from robo_manip_baselines.rollout.demonstrate import Collection
-from robo_manip_baselines.rollout.evaluation import FIRST_SEED, EvaluationConfig
+from robo_manip_baselines.rollout.evaluation import (
+    FIRST_SEED,
+    EvaluationConfig,
+    evaluated_people,
+)
 from robo_manip_baselines.rollout.results import EpisodeResult
 from robo_manip_baselines.runs.checkpoints import MANIFEST
 from robo_manip_baselines.runs.errors import RequestError
@@ -420,7 +424,7 @@ def make_plan(
 def _require_declared(condition: ConditionConfig, people: DrawnPeople, face: str) -> None:
     """Refuse a trained policy that brings along people or a face that were not declared."""
     recorded = read_checkpoint(condition.checkpoint).dataset.get("env_kwargs", {})
-    drawn = "test" if recorded.get("people") == "train" else recorded.get("people", "all")
+    drawn = evaluated_people(recorded)
     if not people and drawn != people.evaluation:
         raise RequestError(
             f"condition '{condition.name}': its policy is evaluated on the people '{drawn}', of "

@@ -171,6 +171,15 @@ class EvaluationConfig:
         return cls(**given)
 
 
+def evaluated_people(recorded: Mapping[str, Any]) -> str:
+    """Return whose motion an evaluation draws where nothing else is given: people not trained on.
+
+    ``recorded`` are the arguments of the demonstrations' environment.
+    """
+    people = recorded.get("people", "all")
+    return "test" if people == "train" else people
+
+
 @dataclass(frozen=True)
 class EvaluationPlan:
     """An `EvaluationConfig` with its checkpoint read and everything checked.
@@ -221,8 +230,9 @@ class EvaluationPlan:
             recorded = {k: v for k, v in recorded.items() if k != "motion_sha256"}
         if "motion" in config.env_kwargs and not parse_motion(config.env_kwargs["motion"]).recorded:
             recorded = {name: value for name, value in recorded.items() if name != "clips"}
-        if recorded.get("people") == "train":  # its clips are of people whom it has seen
-            recorded = {k: v for k, v in recorded.items() if k != "clips"} | {"people": "test"}
+        if (people := evaluated_people(recorded)) != recorded.get("people", people):
+            # its clips are of people whom it has seen
+            recorded = {k: v for k, v in recorded.items() if k != "clips"} | {"people": people}
         env_kwargs = pin_library({**recorded, **config.env_kwargs})
         env = EnvConfig(checkpoint.env, spec, env_kwargs)
         xml_hash = _require_fit(checkpoint, env)
