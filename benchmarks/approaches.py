@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -29,13 +29,13 @@ from face_prediction.commands.train import run_train
 from face_prediction.dataset.sequences import KINDS
 from face_prediction.dataset.split import SplitName
 from face_prediction.evaluation.tables import PAPER_TABLE_1, PAPER_TABLE_2, RESULTS
-from face_prediction.markdown import markdown_table
 from face_prediction.models.settings import Decay
 from face_prediction.training.options import FaceTrainOptions
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.documents import read_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import file_digest, write_text
+from robo_manip_baselines.runs.markdown import markdown_table
 from robo_manip_baselines.runs.metrics import read_metrics
 from robo_manip_baselines.runs.ranges import Amount, Count, Fraction, Seed
 
@@ -324,7 +324,7 @@ def page(options: Options) -> str:
             "*Gain of the last third*: how much lower the best error is than that of the first two "
             "thirds of the steps; a curve that has gone flat gains nothing."
         )
-        parts.append(_markdown([head, *trainings]))
+        parts.append(markdown_table(head, trainings))
     return "\n\n".join(parts) + "\n"
 
 
@@ -340,7 +340,7 @@ def table_1(rows: dict[str, Rows]) -> str:
         if name in PAPER_NAMES:
             printed = ["–" if x is None else f"{x:.3f}" for x in paper[PAPER_NAMES[name]]]
             lines.append([f"*paper, {PAPER_NAMES[name]}*", "", "100", *printed])
-    return _markdown(lines)
+    return markdown_table(lines[0], lines[1:])
 
 
 def table_2(rows: dict[str, Rows]) -> str:
@@ -354,7 +354,7 @@ def table_2(rows: dict[str, Rows]) -> str:
                 lines.append([heading, name, *(_spread(frame, digits) for frame in values.T)])
         printed = [f"{value:.3f}" for value in PAPER_TABLE_2[heading]]
         lines.append([heading, "*paper, approach 3*", *printed])
-    return _markdown(lines)
+    return markdown_table(lines[0], lines[1:])
 
 
 def orders(rows: dict[str, Rows]) -> str:
@@ -383,7 +383,7 @@ def orders(rows: dict[str, Rows]) -> str:
             ours, theirs = (np.nan_to_num(sign * np.array(v), nan=np.inf) for v in values)
             cells.append(f"{np.sum(ours < theirs)} of {len(common)} seeds")
         lines.append([words, *cells])
-    return _markdown(lines) if len(lines) > 1 else ""
+    return markdown_table(lines[0], lines[1:]) if len(lines) > 1 else ""
 
 
 def training_lines(out: Path) -> Iterator[list[str]]:
@@ -405,10 +405,6 @@ def training_lines(out: Path) -> Iterator[list[str]]:
             f"{least[-1]:.4f}",
             f"{100 * (1 - least[-1] / before):.1f} %",
         ]
-
-
-def _markdown(lines: Sequence[Sequence[str]]) -> str:
-    return "\n".join(markdown_table(lines[0], lines[1:]))
 
 
 def _spread(values: np.ndarray, digits: int) -> str:
@@ -458,7 +454,7 @@ def times_table(options: Options) -> str:
         weights = sum(parameter.numel() for parameter in model.parameters())
         cells = [f"{weights:,}", f"{1e3 * step:.0f}", f"{step * options.steps / 60:.0f}"]
         lines.append([approach, *cells])
-    return _markdown(lines) + "\n"
+    return markdown_table(lines[0], lines[1:]) + "\n"
 
 
 def main() -> None:

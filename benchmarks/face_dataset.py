@@ -32,6 +32,7 @@ from face_prediction.tracking.geometry import LIPS
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.markdown import markdown_table
 
 
 def sizes(dataset: FaceDataset) -> tuple[Counter[str], int, int]:
@@ -107,26 +108,23 @@ def held_out_error(inputs: np.ndarray, wanted: np.ndarray, fold: np.ndarray) -> 
 
 def crop_table(dataset: FaceDataset, tracks: Path) -> str:
     """Markdown table of the information leaked by crops around history and whole sequence."""
-    lines = [
-        "| crop around | axes | off the middle | ... then moves to the other side "
-        "| error from last steps | ... and place | both where off the middle |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ["crop around", "axes", "off the middle", "... then moves to the other side"]
+    head += ["error from last steps", "... and place", "both where off the middle"]
+    rows = []
     for crop_from in ("history", "sequence"):
         middle, future, last, fold = places(dataset, tracks, crop_from)
         off = np.abs(middle) > 1.5 / 256
         place = np.stack([last, middle, np.where(off, middle, 0.0)], axis=1)
         motion = held_out_error(last[:, None], future, fold)
         both = held_out_error(place, future, fold)
-        told = "–", "–"
+        moved = where_off = "–"
         if off.any():
             share = np.mean(np.sign(future[off]) == -np.sign(middle[off]))
-            told = f"{100 * share:.1f} %", f"{motion[off].mean():.4f} {both[off].mean():.4f}"
-        lines.append(
-            f"| {crop_from} | {len(middle)} | {100 * off.mean():.1f} % | {told[0]} "
-            f"| {motion.mean():.5f} | {both.mean():.5f} | {told[1]} |"
-        )
-    return "\n".join(lines)
+            moved = f"{100 * share:.1f} %"
+            where_off = f"{motion[off].mean():.4f} {both[off].mean():.4f}"
+        cells = [crop_from, len(middle), f"{100 * off.mean():.1f} %", moved]
+        rows.append([*cells, f"{motion.mean():.5f}", f"{both.mean():.5f}", where_off])
+    return markdown_table(head, rows)
 
 
 def main() -> None:

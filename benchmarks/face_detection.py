@@ -36,6 +36,7 @@ from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import atomic_file
 from robo_manip_baselines.runs.images import encode_image
+from robo_manip_baselines.runs.markdown import markdown_table
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA, WIDTH, HEIGHT = "front_close", 640, 480
@@ -123,14 +124,14 @@ def table(views: Sequence[View], errors: NDArray[np.float64]) -> str:
     """Markdown: a row per clip and one for all."""
     distance = np.linalg.norm(errors, axis=1)
     clips = np.array([view.clip for view in views])
-    lines = ["| clip | found | median px | 95 % px | largest px |", "|---|---|---|---|---|"]
-    rows = [(clip, clips == clip) for clip in sorted(set(clips))]
-    rows.append(("all", np.ones(len(clips), dtype=bool)))
-    for name, chosen in rows:
+    groups = [(clip, clips == clip) for clip in sorted(set(clips))]
+    groups.append(("all", np.ones(len(clips), dtype=bool)))
+    rows = []
+    for name, chosen in groups:
         there = distance[chosen & np.isfinite(distance)]
-        numbers = " | ".join(f"{v:.1f}" for v in np.percentile(there, [50, 95, 100]))
-        lines.append(f"| {name} | {len(there)} of {chosen.sum()} | {numbers} |")
-    return "\n".join(lines)
+        numbers = (f"{v:.1f}" for v in np.percentile(there, [50, 95, 100]))
+        rows.append((name, f"{len(there)} of {chosen.sum()}", *numbers))
+    return markdown_table(["clip", "found", "median px", "95 % px", "largest px"], rows)
 
 
 def write_pictures(views: Sequence[View], errors: NDArray[np.float64], folder: Path) -> None:

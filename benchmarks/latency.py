@@ -29,6 +29,7 @@ from robo_manip_baselines.rollout.results import Proportion
 from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import atomic_file, write_json, write_text
+from robo_manip_baselines.runs.markdown import markdown_table
 from robo_manip_baselines.runs.ranges import Episodes, Processes, Seed
 
 EXAMPLE = "python benchmarks/latency.py --checkpoint runs/flow --delays 0 4 8 --num_episodes 100"
@@ -125,14 +126,12 @@ def write(folder: Path, cells: list[Cell]) -> None:
 
 def table(cells: list[Cell]) -> str:
     """Return a Markdown table, a row for each combination."""
-    lines = [
-        "| strategy | delay | action steps | success, % | strict success, % |",
-        "|---|---|---|---|---|",
+    head = ["strategy", "delay", "action steps", "success, %", "strict success, %"]
+    rows = [
+        [c.strategy, c.delay, c.steps or "ensemble", *map(_percent, (c.success, c.strict_success))]
+        for c in cells
     ]
-    for c in cells:
-        rates = " | ".join(_percent(p) for p in (c.success, c.strict_success))
-        lines.append(f"| {c.strategy} | {c.delay} | {c.steps or 'ensemble'} | {rates} |")
-    return "\n".join(lines) + "\n"
+    return markdown_table(head, rows) + "\n"
 
 
 def _percent(share: Proportion) -> str:

@@ -44,6 +44,7 @@ from robo_manip_baselines.rollout.results import Proportion
 from robo_manip_baselines.runs.command import run_command
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import AppendFile, atomic_file, write_json, write_text
+from robo_manip_baselines.runs.markdown import markdown_table
 from robo_manip_baselines.runs.processes import answers
 from robo_manip_baselines.runs.versions import software_versions
 
@@ -297,15 +298,13 @@ def tables(rows: Sequence[Row]) -> str:
 def outcome_table(groups: dict[str, list[Row]]) -> str:
     """Success, errors of the aim within 0.2 m of the mouth, and forces."""
     near = DISTANCES.index(0.2)
-    lines = [
-        "| the servo sees | episodes | success | strict success | completion s | aim: lateral mm | "
-        "depth mm | across mm | along mm | largest force N |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = ["the servo sees", "episodes", "success", "strict success", "completion s"]
+    head += ["aim: lateral mm", "depth mm", "across mm", "along mm", "largest force N"]
+    rows = []
     for name, own in groups.items():
         times = [row.completion_time for row in own if row.completion_time is not None]
         errors = _rms(own, "aim", range(near))
-        numbers = [" | ".join(["-"] * 4)] if name == "truth" else [_millimetres(errors)]
+        numbers = ["-"] * 4 if name == "truth" else [f"{value:.1f}" for value in errors]
         cells = [
             name,
             str(len(own)),
@@ -316,8 +315,8 @@ def outcome_table(groups: dict[str, list[Row]]) -> str:
             f"{np.mean([r.face_force for r in own]):.1f} (mean), "
             f"{max(r.face_force for r in own):.1f}",
         ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append(cells)
+    return markdown_table(head, rows)
 
 
 def failure_table(groups: dict[str, list[Row]]) -> str:
@@ -327,11 +326,8 @@ def failure_table(groups: dict[str, list[Row]]) -> str:
     ]
     if not kinds:
         return "No episode failed."
-    lines = [f"| the servo sees | {' | '.join(kinds)} |", "|---" * (len(kinds) + 1) + "|"]
-    for name, own in groups.items():
-        counts = " | ".join(str(_count(own, kind)) for kind in kinds)
-        lines.append(f"| {name} | {counts} |")
-    return "\n".join(lines)
+    rows = [[name, *(_count(own, kind) for kind in kinds)] for name, own in groups.items()]
+    return markdown_table(["the servo sees", *kinds], rows)
 
 
 def _count(rows: Sequence[Row], kind: str) -> int:
@@ -341,7 +337,7 @@ def _count(rows: Sequence[Row], kind: str) -> int:
 def difference_table(groups: dict[str, list[Row]]) -> str:
     """Success with each minus success with the camera, on the seeds that both have."""
     rng = np.random.default_rng(0)
-    lines = ["| success minus that of `camera` | points | 95 % |", "|---|---|---|"]
+    rows = []
     ours = {row.seed: row.is_success for row in groups["camera"]}
     for name, own in groups.items():
         if name == "camera":
@@ -350,8 +346,8 @@ def difference_table(groups: dict[str, list[Row]]) -> str:
         apart = np.array([float(row.is_success) - float(ours[row.seed]) for row in shared])
         drawn = rng.choice(apart, (10_000, len(apart))).mean(axis=1)
         low, high = 100 * np.quantile(drawn, [0.025, 0.975])
-        lines.append(f"| {name} | {100 * apart.mean():+.0f} | {low:+.0f} … {high:+.0f} |")
-    return "\n".join(lines)
+        rows.append((name, f"{100 * apart.mean():+.0f}", f"{low:+.0f} … {high:+.0f}"))
+    return markdown_table(["success minus that of `camera`", "points", "95 %"], rows)
 
 
 def finding(groups: dict[str, list[Row]]) -> str:
@@ -378,11 +374,9 @@ def finding(groups: dict[str, list[Row]]) -> str:
 
 def distance_table(groups: dict[str, list[Row]]) -> str:
     """Detection and error by the distance between gripper and mouth."""
-    lines = [
-        "| gripper to mouth, m | source | steps | no face | in the image: lateral mm | depth mm | "
-        "aim: lateral mm | depth mm |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    head = ["gripper to mouth, m", "source", "steps", "no face", "in the image: lateral mm"]
+    head += ["depth mm", "aim: lateral mm", "depth mm"]
+    rows = []
     for place in range(len(DISTANCES) - 1):
         low, high = DISTANCES[place : place + 2]
         label = f"{low:g} … {high:g}" if high < 1 else f"{low:g} and more"
@@ -394,17 +388,16 @@ def distance_table(groups: dict[str, list[Row]]) -> str:
             unseen = sum(row.errors[place].unseen for row in own) / steps
             seen, aim = (_rms(own, kind, [place]) for kind in ("seen", "aim"))
             share = f"{unseen:.1%}" if "camera" in name else "-"
-            numbers = " | ".join(f"{v:.1f}" for v in (*seen[:2], *aim[:2]))
-            lines.append(f"| {label} | {name} | {steps} | {share} | {numbers} |")
-    return "\n".join(lines)
+            numbers = (f"{v:.1f}" for v in (*seen[:2], *aim[:2]))
+            rows.append((label, name, steps, share, *numbers))
+    return markdown_table(head, rows)
 
 
 def speed_table(groups: dict[str, list[Row]]) -> str:
     """Control steps a second, and latency."""
-    lines = [
-        "| source | control steps/s, median | a second of one core | detector and predictor, ms |",
-        "|---|---|---|---|",
-    ]
+    head = ["source", "control steps/s, median", "a second of one core"]
+    head += ["detector and predictor, ms"]
+    rows = []
     for name in ("truth", "camera", "depth_camera"):
         if own := groups.get(name):
             rates = [row.steps_per_second for row in own]
@@ -412,8 +405,8 @@ def speed_table(groups: dict[str, list[Row]]) -> str:
             late = f"{1e3 * np.median(taken):.0f}" if taken else "-"
             known = [r.steps_per_cpu_second for r in own if r.steps_per_cpu_second is not None]
             core = f"{np.median(known):.0f}" if known else "-"
-            lines.append(f"| {name} | {np.median(rates):.0f} | {core} | {late} |")
-    return "\n".join(lines)
+            rows.append((name, f"{np.median(rates):.0f}", core, late))
+    return markdown_table(head, rows)
 
 
 def _rms(rows: Sequence[Row], kind: str, places: Sequence[int] | range) -> NDArray[np.float64]:
@@ -422,10 +415,6 @@ def _rms(rows: Sequence[Row], kind: str, places: Sequence[int] | range) -> NDArr
     total = sum((np.array(getattr(item, kind)) for item in chosen), np.zeros(5))
     mean = total / max(sum(item.steps for item in chosen), 1)
     return 1e3 * np.sqrt([mean[0] + mean[1], mean[2], mean[3], mean[4]])
-
-
-def _millimetres(values: NDArray[np.float64]) -> str:
-    return " | ".join(f"{value:.1f}" for value in values)
 
 
 def _proportion(outcomes: Sequence[bool]) -> str:

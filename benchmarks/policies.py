@@ -39,6 +39,7 @@ from robo_manip_baselines.runs.command import parse, run_command
 from robo_manip_baselines.runs.documents import convert, parse_json, read_json
 from robo_manip_baselines.runs.errors import RequestError, require_choice
 from robo_manip_baselines.runs.files import write_json, write_text
+from robo_manip_baselines.runs.markdown import markdown_table
 from robo_manip_baselines.runs.ranges import Count, Episodes, NonNegativeInt, Processes, Seed
 from robo_manip_baselines.training.config import (
     CONFIG,
@@ -77,6 +78,9 @@ OBSERVATIONS = {
 """Name of an observation -> its options of ``bin/Train.py``."""
 
 POLICIES = ("Act", "Mlp", "Diffusion", "Flow", "Sarnn")
+
+RATES = ("success, %", "strict success, %", "safe success, %")
+"""Columns of a table."""
 
 TABLE, TIMES = "policies.md", "times.md"
 EPISODES, ROWS = "episodes", "rows"
@@ -311,11 +315,9 @@ def time_prediction(
 
 def times_table(options: Options) -> str:
     """Measure processor times without any training; return a Markdown table."""
-    lines = [
-        "| policy | observation | weights | steps | a step of training, ms | training, s "
-        "| a prediction, ms | an action, ms |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    head = ["policy", "observation", "weights", "steps", "a step of training, ms", "training, s"]
+    head += ["a prediction, ms", "an action, ms"]
+    rows = []
     for observation in options.observations:
         for policy in options.policies:
             config = configure(options, policy, observation, options.train_seeds[0])
@@ -332,22 +334,19 @@ def times_table(options: Options) -> str:
             cells = [policy, observation, f"{weights:,}", str(setup.total_steps)]
             cells += [f"{1e3 * seconds / setup.total_steps:.1f}", f"{seconds:.0f}"]
             cells += [f"{prediction:.1f}", f"{action:.1f}"]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+            rows.append(cells)
+    return markdown_table(head, rows) + "\n"
 
 
 def trainings_table(rows: Sequence[Row]) -> str:
     """Return a Markdown table, a row for each training."""
-    lines = [
-        "| policy | observation | training seed | episodes | success, % | strict success, % "
-        "| safe success, % |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        cells: list[Any] = [r.policy, r.observation, r.train_seed, r.episodes]
-        cells += [_percent(share) for share in (r.success, r.strict_success, r.safe_success)]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines) + "\n"
+    head = ["policy", "observation", "training seed", "episodes", *RATES]
+    cells = (
+        [r.policy, r.observation, r.train_seed, r.episodes]
+        + [_percent(share) for share in (r.success, r.strict_success, r.safe_success)]
+        for r in rows
+    )
+    return markdown_table(head, cells) + "\n"
 
 
 def policies_table(rows: Sequence[Row], outcomes: dict[str, OutcomeMatrix]) -> str:
@@ -358,12 +357,10 @@ def policies_table(rows: Sequence[Row], outcomes: dict[str, OutcomeMatrix]) -> s
         outcomes: of ``POLICY shown OBSERVATION``; each is compared with the first of them on the
             seeds that both have.
     """
-    lines = [
-        "| policy | observation | trainings | episodes of each | success, % | strict success, % "
-        "| safe success, % | success less that of the first, points | p | weights "
-        "| training, s | a prediction, ms | an action, ms |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = ["policy", "observation", "trainings", "episodes of each", *RATES]
+    head += ["success less that of the first, points", "p", "weights"]
+    head += ["training, s", "a prediction, ms", "an action, ms"]
+    lines = []
     first = next(iter(outcomes), None)
     for name, own in outcomes.items():
         policy, _, observation = name.partition(" shown ")
@@ -387,8 +384,8 @@ def policies_table(rows: Sequence[Row], outcomes: dict[str, OutcomeMatrix]) -> s
         cells = [policy, observation, str(len(of_it)), f"{len(own.seeds)}", *rates, *difference]
         cells += [f"{of_it[0].parameters:,}", f"{training:.0f}"]
         cells += [f"{prediction:.1f}", f"{action:.1f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append(cells)
+    return markdown_table(head, lines) + "\n"
 
 
 def page(out: Path) -> str:

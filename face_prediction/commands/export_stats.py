@@ -38,6 +38,7 @@ from face_prediction.prediction.errors import mouth_residuals
 from face_prediction.tracking.geometry import VERTICAL_FOV_DEGREES
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import FileKind, require_out_file
+from robo_manip_baselines.runs.markdown import markdown_table
 from robo_manip_baselines.runs.progress import ProgressBar
 from robo_manip_baselines.runs.ranges import Count, require_ranges
 
@@ -232,8 +233,9 @@ def median_crop_span(dataset: FaceDataset, clips: Iterable[str]) -> float:
 
 def error_stats_table(stats: PredictorErrorStats) -> str:
     """Mean absolute errors by frame ahead, as Markdown."""
-    lines = ["| frame ahead | dU crop | dV crop | across mm | up mm |", "|---|---|---|---|---|"]
+    rows = []
     for horizon in stats.horizons:
-        (u, v), (x, y) = horizon.mean_abs, horizon.mean_abs_m
-        lines.append(f"| {horizon.frames} | {u:.4f} | {v:.4f} | {1e3 * x:.2f} | {1e3 * y:.2f} |")
-    return "\n".join(lines)
+        crops = (f"{value:.4f}" for value in horizon.mean_abs)
+        millimetres = (f"{1e3 * value:.2f}" for value in horizon.mean_abs_m)
+        rows.append((horizon.frames, *crops, *millimetres))
+    return markdown_table(["frame ahead", "dU crop", "dV crop", "across mm", "up mm"], rows)

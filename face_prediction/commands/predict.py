@@ -31,7 +31,6 @@ from face_prediction.dataset.sequences import ClipFrames, SequenceSettings, clip
 from face_prediction.dataset.tracks import pixel_landmarks
 from face_prediction.evaluation.predictors import batch_size, cross_fit, require_strangers
 from face_prediction.forecast.interface import mouth_centre
-from face_prediction.markdown import markdown_table
 from face_prediction.motion.library import (
     MOTION_LIBRARY,
     LiftedClip,
@@ -46,6 +45,7 @@ from face_prediction.prediction.interface import Predictor, StatefulPredictor
 from face_prediction.tracking.tracks import load_track
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest, locked_file, require_out_file
+from robo_manip_baselines.runs.markdown import markdown_table
 from robo_manip_baselines.runs.progress import ProgressBar
 from robo_manip_baselines.runs.ranges import require_ranges
 
@@ -340,4 +340,4 @@ def error_table(errors: dict[str, dict[str, Means]], name: str) -> str:
     count = len(errors["all"]["forecast"])
     rows = [[clip, *map(shown, zip(*row.values(), strict=True))] for clip, row in errors.items()]
     title = f"Mean distance across the view in mm by frame ahead: {name} / persistence"
-    return "\n".join([title, "", *markdown_table(["clip", *map(str, range(1, count + 1))], rows)])
+    return "\n".join([title, "", markdown_table(["clip", *map(str, range(1, count + 1))], rows)])

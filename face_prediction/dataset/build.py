@@ -31,13 +31,13 @@ from face_prediction.dataset.sequences import (
     kind_of,
     sequence_statistics,
 )
-from face_prediction.markdown import markdown_table
 from face_prediction.motion.attribution import Attribution
 from face_prediction.tracking.tracks import FaceTrack, load_track
 from face_prediction.tracking.video import VideoReader, with_bar
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import file_digest
 from robo_manip_baselines.runs.images import encode_image
+from robo_manip_baselines.runs.markdown import markdown_table
 
 SAME_CLOCK = 1e-6
 """Two clocks of one video agree to this many seconds; they are read from the same file."""
@@ -243,7 +243,7 @@ def kind_table(clips: Sequence[ClipEntry], rows: Sequence[SequenceRow]) -> str:
             columns = [[row[key] for row in found] for key in keys] if found else []
             medians = [factor * float(np.median(column)) for column in columns]
             table[-1].append(" ".join(f"{value:.{digits}f}" for value in medians) or "–")
-    return "\n".join(markdown_table(head, table))
+    return markdown_table(head, table)
 
 
 def fold_table(clips: Sequence[ClipEntry], folds: int) -> str:
@@ -254,4 +254,4 @@ def fold_table(clips: Sequence[ClipEntry], folds: int) -> str:
         part = [clip for clip in clips if clip.fold == fold]
         counts = [sum(c.sequences for c in part if c.kind == kind) for kind in kinds]
         rows.append([fold, len({clip.subject for clip in part}), sum(counts), *counts])
-    return "\n".join(markdown_table(["fold", "subjects", "sequences", *kinds], rows))
+    return markdown_table(["fold", "subjects", "sequences", *kinds], rows)

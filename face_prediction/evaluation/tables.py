@@ -21,9 +21,9 @@ from face_prediction.evaluation.error_stats import compact_json
 from face_prediction.evaluation.scoring import LEVELS
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.evaluation.statistics import GROUPS, KindSummary
-from face_prediction.markdown import markdown_table
 from robo_manip_baselines.runs.documents import convert, read_json
 from robo_manip_baselines.runs.files import FolderKind, write_text
+from robo_manip_baselines.runs.markdown import markdown_table
 
 Format = Callable[[float], str]
 Column = tuple[str, tuple[Any, ...], Format, str | None]
@@ -204,7 +204,7 @@ def markdown_table_1(summary: KindSummary) -> str:
         printed = [_NOTHING if value is None else f"{value:.3f}" for value in values]
         cells = [f"paper, {name} (other data)", *printed[:-1], f"{printed[-1]} at 256 px"]
         rows.append(cells + [""] * (len(head) - len(cells)))
-    return "\n".join(markdown_table(head, rows))
+    return markdown_table(head, rows)
 
 
 def results_json(report: EvaluationReport, files: Sequence[str] = ()) -> str:
@@ -227,7 +227,7 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
 
     def table(head: Sequence[str], chosen: Iterable[int], *columns: Column) -> str:
         cells = ([rows[i].name, *_cells(summary, i, columns)] for i in chosen)
-        return "\n".join(markdown_table(head, cells))
+        return markdown_table(head, cells)
 
     forecasts = [i for i, row in rows.items() if row.role != "reference"]
     count = f"{summary.sequences} sequences of {summary.subjects} {people}"
@@ -259,7 +259,7 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
         cells = [line for line in cells if set(line[1:]) != {_NOTHING}]
         if len(frames) == len(PAPER_TABLE_2[heading]):
             cells.append(["paper, approach 3 (other data)", *map(_ssim, PAPER_TABLE_2[heading])])
-        parts.append("\n".join(markdown_table([heading, *frames], cells)))
+        parts.append(markdown_table([heading, *frames], cells))
     cells = []
     for i, row in rows.items():
         for level in TABULATED_LEVELS if row.has_intervals else ():
@@ -268,7 +268,7 @@ def _kind_sections(summary: KindSummary, history: int) -> list[str]:
             cells.append([f"{row.name}, {level:.0%}", *_cells(summary, i, columns)])
     if cells:
         parts.append("### Coverage of the mouth centre's intervals, U and V together, in percent")
-        parts.append("\n".join(markdown_table(by_frame, cells)))
+        parts.append(markdown_table(by_frame, cells))
     change: Column = ("shuffled_images", (), _percent, " to ")
     shuffled = [i for i in rows if not np.isnan(summary.numbers[change[0]].value[i]).all()]
     if shuffled:

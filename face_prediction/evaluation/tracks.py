@@ -30,10 +30,10 @@ from face_prediction.evaluation.predictors import EvaluatedPredictor
 from face_prediction.evaluation.scoring import interval_levels
 from face_prediction.evaluation.setup import PERSISTENCE
 from face_prediction.forecast.interface import mouth_centre
-from face_prediction.markdown import markdown_table
 from face_prediction.prediction.interface import Predictor, StatefulPredictor, TrackForecast
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.files import write_text
+from robo_manip_baselines.runs.markdown import markdown_table
 from robo_manip_baselines.runs.progress import ProgressBar
 
 Floats = NDArray[np.float64]
@@ -297,7 +297,7 @@ def tracks_markdown(
             [name, *(_cell(value, ".4f") for value in means[i])]
             for i, (name, _) in enumerate(scores.rows)
         ]
-        parts.append("\n".join(markdown_table(head, rows)))
+        parts.append(markdown_table(head, rows))
         value, low, high = differences(scores, resamples, seed)
         networks = [i for i, (_, role) in enumerate(scores.rows) if role == "network"]
         if networks:
@@ -314,7 +314,7 @@ def tracks_markdown(
                 ]
                 for i in networks
             ]
-            parts.append("\n".join(markdown_table(head, rows)))
+            parts.append(markdown_table(head, rows))
         covered = coverages(scores)
         rows = [
             [f"{scores.rows[i][0]}, {nominal:.0%}", *(_cell(v, ".1f") for v in covered[i, :, k])]
@@ -324,12 +324,12 @@ def tracks_markdown(
         ]
         if rows:
             parts.append("### Coverage of intervals, in percent")
-            parts.append("\n".join(markdown_table(head, rows)))
+            parts.append(markdown_table(head, rows))
         parts.append(f"### By person, frames 3–5, against {scores.rows[scores.best][0]}")
         head = ["person", "forecasts", "smoothness", scores.rows[scores.best][0]]
         head += [scores.rows[i][0] for i in networks]
         head += [f"{scores.rows[i][0]}, 90 % hold" for i in networks]
-        parts.append("\n".join(markdown_table(head, _person_rows(scores, networks))))
+        parts.append(markdown_table(head, _person_rows(scores, networks)))
     return "\n\n".join(parts) + "\n"
 
 

@@ -25,6 +25,7 @@ from face_prediction.live.streaming import LiveForecast, StreamingPredictor
 from face_prediction.tracking.geometry import LIPS, Crop
 from face_prediction.tracking.video import VideoFrame
 from robo_manip_baselines.runs.errors import RequestError
+from robo_manip_baselines.runs.markdown import markdown_table
 
 RECENT = 30  # frames that the rates on the screen are averaged over
 STAGES = ("detector", "predictor", "whole")
@@ -60,13 +61,13 @@ class LiveStatistics:
 
     def times_table(self) -> str:
         """Mean and 95 % quantile of every stage, as Markdown."""
-        lines = ["| | frames | mean ms | 95 % ms | a second |", "|---|---|---|---|---|"]
+        rows = []
         for stage, seconds in self.seconds.items():
             if seconds:
                 mean, high = 1e3 * np.mean(seconds), 1e3 * np.quantile(seconds, 0.95)
-                times = f"{mean:.1f} | {high:.1f} | {1e3 / mean:.1f}"
-                lines.append(f"| {stage} | {len(seconds)} | {times} |")
-        return "\n".join(lines)
+                times = (f"{value:.1f}" for value in (mean, high, 1e3 / mean))
+                rows.append((stage, len(seconds), *times))
+        return markdown_table(["", "frames", "mean ms", "95 % ms", "a second"], rows)
 
 
 def run_loop(

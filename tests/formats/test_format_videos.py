@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import wave
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +86,15 @@ def test_damaged_videos_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "bad.mp4").write_bytes(b"no video")
     with pytest.raises(RequestError, match="is no video"):
         VideoReader(tmp_path / "bad.mp4")
+
+
+def test_a_refused_file_is_closed(tmp_path: Path) -> None:
+    sound = tmp_path / "sound.wav"
+    with wave.open(str(sound), "wb") as file:
+        file.setparams((1, 2, 8000, 0, "NONE", ""))
+        file.writeframes(bytes(16000))
+    with pytest.raises(RequestError, match="is no video") as caught:
+        VideoReader(sound)
+    assert caught.value.__traceback__ is not None  # which holds what was being made
+    files = [link.resolve() for link in Path("/proc/self/fd").iterdir()]
+    assert sound.resolve() not in files

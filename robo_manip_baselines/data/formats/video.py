@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -192,17 +193,20 @@ class VideoReader:
 
     def __init__(self, path: Path, threads: int = 0) -> None:
         self.path = path
-        try:
-            self._container = av.open(str(path))
-            self._stream: Any = self._container.streams.video[0]
-        except (OSError, ValueError, IndexError) as error:
-            raise RequestError(f"'{path}' is no video: {' '.join(str(error).split())}") from error
-        self._stream.codec_context.thread_count = threads
-        self._stream.thread_type = "AUTO" if threads != 1 else "NONE"
-        self._fps = Fraction(self._stream.average_rate or self._stream.base_rate or 0)
-        if not self._fps:
-            raise RequestError(f"'{path}' is no video: it has no frame rate")
-        self._start = self._stream.start_time or 0
+        with ExitStack() as stack:
+            try:
+                self._container = stack.enter_context(av.open(str(path)))
+                self._stream: Any = self._container.streams.video[0]
+            except (OSError, ValueError, IndexError) as error:
+                message = f"'{path}' is no video: {' '.join(str(error).split())}"
+                raise RequestError(message) from error
+            self._stream.codec_context.thread_count = threads
+            self._stream.thread_type = "AUTO" if threads != 1 else "NONE"
+            self._fps = Fraction(self._stream.average_rate or self._stream.base_rate or 0)
+            if not self._fps:
+                raise RequestError(f"'{path}' is no video: it has no frame rate")
+            self._start = self._stream.start_time or 0
+            stack.pop_all()  # open until `__exit__`
 
     @property
     def info(self) -> VideoInfo:
