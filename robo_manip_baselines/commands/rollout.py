@@ -163,22 +163,12 @@ class RolloutOptions:
         start = first if self.seed is None else self.seed
         return range(start, start + self.num_episodes)
 
+
+class EnvOptions(Protocol):
+    """Options about the environment: the face, its motion, and what only some tasks have."""
+
     @property
-    def env_arguments(self) -> dict[str, Any]:
-        """Arguments of the environment that were given: of the face, and of the task alone.
-
-        Raises:
-            RequestError: one is not valid, or the task has no such argument.
-        """
-        given = face_arguments(self)
-        if self.utensil is not None:
-            given["utensil"] = task_entry(self.env).require_argument("utensil", self.utensil)
-        return given
-
-
-class FaceOptions(Protocol):
-    """Options about the face and its motion."""
-
+    def env(self) -> str: ...  # noqa: D102
     @property
     def face(self) -> str | None: ...  # noqa: D102
     @property
@@ -190,14 +180,16 @@ class FaceOptions(Protocol):
     @property
     def clips(self) -> tuple[str, ...]: ...  # noqa: D102
     @property
+    def utensil(self) -> str | None: ...  # noqa: D102
+    @property
     def motion_library(self) -> Path | None: ...  # noqa: D102
 
 
-def face_arguments(options: FaceOptions) -> dict[str, Any]:
-    """Return the arguments of the environment about the face and its motion that were given.
+def env_arguments(options: EnvOptions) -> dict[str, Any]:
+    """Return the arguments of the environment that were given: of the face, and of the task alone.
 
     Raises:
-        RequestError: there are no such face, motion or people.
+        RequestError: there are no such face, motion or people, or the task has no such argument.
     """
     from robo_manip_baselines.envs.mujoco.face import FACES
     from robo_manip_baselines.envs.mujoco.face.motions import parse_motion
@@ -209,6 +201,8 @@ def face_arguments(options: FaceOptions) -> dict[str, Any]:
         "motion": None if options.motion is None else str(parse_motion(options.motion)),
         "people": options.people and require_choice("people", options.people, PEOPLE),
         "clips": options.clips,
+        "utensil": options.utensil
+        and task_entry(options.env).require_argument("utensil", options.utensil),
         "motion_library": options.motion_library and str(options.motion_library),
     }
     return {name: value for name, value in given.items() if value}
@@ -274,7 +268,7 @@ def to_collection(options: RolloutOptions) -> Collection:
         out=options.out or Path("dataset") / options.env,
         expert=demonstration.expert or next(iter(task_entry(options.env).experts)),
         seeds=options.seeds(first=0),
-        env_kwargs={**env_kwargs, "face_motion": "episode", **options.env_arguments},
+        env_kwargs={**env_kwargs, "face_motion": "episode", **env_arguments(options)},
         codec=demonstration.image_codec,
         quality=demonstration.image_quality,
         workers=options.workers,
@@ -363,7 +357,7 @@ def to_evaluation(options: RolloutOptions, checkpoint: Checkpoint | None) -> Eva
         checkpoint=given.checkpoint,
         seeds=options.seeds(FIRST_SEED),
         out=options.out,
-        env_kwargs=options.env_arguments,
+        env_kwargs=env_arguments(options),
         corruption=None if by_camera or corruption == trained.corruption else corruption,
         mouth_source=options.spec.mouth_source,
         camera_latency=options.spec.camera_latency,

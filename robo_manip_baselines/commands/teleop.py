@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from annotated_types import Interval
 
-from robo_manip_baselines.commands.rollout import changed_options, face_arguments
+from robo_manip_baselines.commands.rollout import changed_options, env_arguments
 from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.tasks.registry import task_entry
 from robo_manip_baselines.observation import CAMERAS, ObservationSpec
@@ -98,6 +98,7 @@ class TeleopOptions:
             sum recorded+tremor.
         people: People who move: all, train or test.
         clips: Recorded clips to draw from; all if not given.
+        utensil: What brings the food in FeedingEnv: gripper (if not given) or spoon.
         motion_library: File of recorded face motion, or extended, which ships, too.
         images: Images of the episodes.
         replay: Only with --device replay.
@@ -119,6 +120,7 @@ class TeleopOptions:
     motion: str | None = None
     people: str | None = None
     clips: tuple[str, ...] = ()
+    utensil: str | None = None
     motion_library: Path | None = None
     images: tyro.conf.OmitArgPrefixes[ImageOptions] = field(default_factory=ImageOptions)
     replay: tyro.conf.OmitArgPrefixes[ReplayOptions] = field(default_factory=ReplayOptions)
@@ -166,7 +168,7 @@ def to_config(options: TeleopOptions) -> TeleopConfig:
         image_size=spec.image_size,
         codec=images.image_codec,
         quality=images.image_quality,
-        env_kwargs=face_arguments(options),
+        env_kwargs=env_arguments(options),
         episodes=options.replay.episodes,
         page=options.page,
         steering=options.steering,

@@ -331,7 +331,9 @@ class EpisodePage:
             except RequestError as error:
                 self._missing = str(error)
                 return
-            self._drawn = [ViserScene(self._server.scene, self._world.world.model)]
+            world = self._world.world
+            scene = ViserScene(self._server.scene, world.model, varying=world.varying_geoms)
+            self._drawn = [scene]
         self._world.load(self._reader)
 
     def _draw_paths(self) -> None:

@@ -156,7 +156,7 @@ class WebDevice:
         scene.configure_default_lights(cast_shadow=False)
         server.initial_camera.position = VIEW_FROM
         server.initial_camera.look_at = VIEW_AT
-        self._scene = ViserScene(scene, world.model)
+        self._scene = ViserScene(scene, world.model, varying=world.varying_geoms)
         self.handles: dict[str, Any] = {}
         for arm in self._arms:
             handle = scene.add_transform_controls(f"/goal/{arm}", HANDLE_SIZE, depth_test=False)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -46,6 +47,8 @@ class FakeNode:
     arguments: dict[str, Any] = field(default_factory=dict)
     position: Any = (0.0, 0.0, 0.0)
     wxyz: Any = (1.0, 0.0, 0.0, 0.0)
+    scale: Any = (1.0, 1.0, 1.0)
+    visible: bool = True
     bones: tuple[FakeNode, ...] = ()
     is_removed: bool = False
 
@@ -149,6 +152,42 @@ def test_bodies_stand_where_the_simulator_has_them(world: FaceEnv) -> None:
     assert colours == [(217, 26, 20)]
     drawn.remove()
     assert scene.nodes["/cell"].is_removed
+
+
+@pytest.mark.parametrize("task", ["DrinkingEnv", "FaceWipingEnv"])
+def test_what_tasks_change_in_their_model_is_followed(task: str) -> None:
+    """Liquid and residue: where MuJoCo draws them, as large, and gone when they are gone."""
+    with closing(make_env(task, cameras=())) as env:
+        env.reset(seed=3)
+        world = world_of(env)
+        model, scene = world.model, FakeScene()
+        drawn = ViserScene(cast(Any, scene), model, varying=world.varying_geoms)
+        if task == "DrinkingEnv":
+            kind, indices = (
+                "geom",
+                [geom for geom in range(model.ngeom) if "cup/slice" in model.geom(geom).name],
+            )
+            before = model.geom_size.copy()
+            cup = model.joint("cup").qposadr[0]
+            world.data.qpos[cup + 3 : cup + 7] = (np.cos(0.5), 0.0, np.sin(0.5), 0.0)
+            world.show_row({"liquid": np.array([0.4, 0.2])})
+            assert not np.array_equal(model.geom_size, before)
+        else:
+            kind, indices = (
+                "site",
+                [site for site in range(model.nsite) if "spot" in model.site(site).name],
+            )
+            model.site_rgba[indices[::2], 3] = 0.0
+        drawn.update(world.data)
+        for place, index in enumerate(indices):
+            body = getattr(model, f"{kind}_bodyid")[index]
+            node = scene.nodes[f"/cell/body_{body}/{kind}_{index}"]
+            for name, found in (("pos", node.position), ("quat", node.wxyz), ("size", node.scale)):
+                wanted = getattr(model, f"{kind}_{name}")[index]
+                np.testing.assert_allclose(found, wanted, atol=2e-6, err_msg=f"{name}, {index}")
+            assert node.visible == (kind == "geom" or place % 2 == 1)
+            extent = np.abs(node.arguments["mesh"].vertices).max(axis=0)
+            np.testing.assert_allclose(extent, 1.0, rtol=0.02)  # 24 sides of a circle
 
 
 def test_skins_deform_as_mujoco_deforms_them(world: FaceEnv) -> None:

@@ -138,6 +138,11 @@ def test_actions_that_lead_elsewhere_are_noticed(recorded: Recorded, tmp_path: P
     assert list_episodes(tmp_path) == []
 
 
+def test_the_spoon_can_be_steered() -> None:
+    options = teleop.TeleopOptions("FeedingEnv", device="replay", utensil="spoon")
+    assert teleop.to_config(options).env_kwargs == {"utensil": "spoon"}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -148,6 +153,7 @@ def test_actions_that_lead_elsewhere_are_noticed(recorded: Recorded, tmp_path: P
         (["--operator", "a\nb"], "operator"),
         (["--image_codec", "gif"], "unknown image codec 'gif'"),
         (["--motion", "flying"], "flying"),
+        (["--utensil", "fork"], "unknown utensil 'fork'"),
         (["--episodes", "there", "--arm", "left"], "there"),
         (["--port", "9"], "--port goes with --device web or spacemouse, not with replay"),
         (["--device", "web", "--mice", "/dev/hidraw3"], "--mice goes with --device keyboard or sp"),

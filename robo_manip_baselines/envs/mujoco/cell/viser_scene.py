@@ -1,6 +1,6 @@
 """A MuJoCo scene in the browser: viser draws a model's geoms and skins, and follows its state.
 
-What MuJoCo's renderer draws by default is drawn: geoms of the groups 0 to 2 that are not
+What MuJoCo's renderer draws by default is drawn: geoms and sites of the groups 0 to 2 that are not
 transparent, and skins, which deform in the browser. viser has no textures on deforming meshes: a
 textured skin is cut into patches of one colour each.
 
@@ -9,6 +9,7 @@ Importing this module needs no viser.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import mujoco
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 DRAWN_GROUPS: Final = 3
-"""Groups of geoms that MuJoCo draws by default: 0, 1 and 2."""
+"""Groups of geoms and sites that MuJoCo draws by default: 0, 1 and 2."""
 
 HIDDEN: Final = ("wall_",)
 """Starts of names of geoms that would hide the scene from a camera that moves around it."""
@@ -38,7 +39,6 @@ PATCH_COLOURS: Final = 6
 MOVED: Final = 1e-6
 """m, or quaternion component, below which a body has not moved and nothing is sent."""
 
-
 _SQUARE: Final = np.array([[0, 1, 2], [0, 2, 3]])
 
 
@@ -49,14 +49,30 @@ class Mesh(NamedTuple):
     faces: NDArray[np.int64]
 
 
+class Shape(NamedTuple):
+    """Geom or site that is drawn for itself, since its pose on its body and its size change.
+
+    Attributes:
+        handle: of viser's mesh, of size 1.
+        kind: geom or site, as the names of the model's arrays begin.
+        number: of the geom or site in the model.
+    """
+
+    handle: Any
+    kind: str
+    number: int
+
+
 class ViserScene:
     """Drawing of a model in a viser scene, below one node.
 
     Args:
         scene: of a viser server.
-        model: to draw.
+        model: to draw; read again with every update for what ``varying`` names, and for sites.
         root: name of the node.
         hidden: starts of names of geoms that are left out.
+        varying: starts of names of boxes, spheres and ellipsoids whose pose on their body and size
+            change in the model, see `FaceEnv.varying_geoms`.
     """
 
     def __init__(
@@ -66,21 +82,27 @@ class ViserScene:
         *,
         root: str = "/cell",
         hidden: tuple[str, ...] = HIDDEN,
+        varying: tuple[str, ...] = (),
     ) -> None:
+        self._scene, self._model, self._root = scene, model, root
         self._node = scene.add_frame(root, show_axes=False)
         self._bodies: dict[int, Any] = {}
-        for (body, colour), parts in _parts(model, hidden).items():
-            if body not in self._bodies:
-                self._bodies[body] = scene.add_frame(f"{root}/body_{body}", show_axes=False)
-            scene.add_mesh_simple(
-                f"{root}/body_{body}/{'_'.join(map(str, colour))}",
-                *joined(parts),
-                color=(colour[0], colour[1], colour[2]),
-                opacity=None if colour[3] == 255 else colour[3] / 255,
-            )
+        for (body, colour), parts in _parts(model, (*hidden, *varying)).items():
+            self._add_mesh(body, "_".join(map(str, colour)), joined(parts), colour)
+        self._shapes = [
+            self._add_shape("geom", geom)
+            for geom in range(model.ngeom)
+            if varying and model.geom(geom).name.startswith(varying)
+        ]
+        self._shapes += [
+            self._add_shape("site", site)
+            for site in range(model.nsite)
+            if model.site_group[site] < DRAWN_GROUPS
+        ]
+        self._update_shapes()
         self._bones: list[tuple[int, Any]] = []
         for skin in range(model.nskin):
-            self._add_skin(scene, model, skin, root)
+            self._add_skin(skin)
 
     def update(self, data: mujoco.MjData) -> None:
         """Move everything to where it is in a state after ``mj_kinematics``.
@@ -88,25 +110,60 @@ class ViserScene:
         Only what has moved is sent. Within ``with server.atomic():`` browsers show it at once.
         """
         for body, handle in (*self._bodies.items(), *self._bones):
-            position, orientation = data.xpos[body], data.xquat[body]
-            if np.abs(handle.position - position).max() > MOVED:
-                handle.position = position
-            if np.abs(handle.wxyz - orientation).max() > MOVED:
-                handle.wxyz = orientation
+            _move(handle, data.xpos[body], data.xquat[body])
+        self._update_shapes()
 
     def remove(self) -> None:
         """Remove the drawing from the scene."""
         self._node.remove()
 
-    def _add_skin(self, scene: viser.SceneApi, model: mujoco.MjModel, skin: int, root: str) -> None:
+    def _add_mesh(self, body: int, name: str, mesh: Mesh, colour: Sequence[int]) -> Any:
+        """Add a mesh of a colour (RGBA, 0-255) below the frame of its body."""
+        frame = f"{self._root}/body_{body}"
+        if body not in self._bodies:
+            self._bodies[body] = self._scene.add_frame(frame, show_axes=False)
+        return self._scene.add_mesh_simple(
+            f"{frame}/{name}",
+            *mesh,
+            color=(colour[0], colour[1], colour[2]),
+            opacity=None if colour[3] == 255 else colour[3] / 255,
+        )
+
+    def _add_shape(self, kind: str, number: int) -> Shape:
+        """Add a geom or a site, of size 1 and in its colour; `update` puts it where it is."""
+        model = self._model
+        form = mujoco.mjtGeom(getattr(model, f"{kind}_type")[number])
+        colour = np.round(255 * getattr(model, f"{kind}_rgba")[number]).astype(int).tolist()
+        body = int(getattr(model, f"{kind}_bodyid")[number])
+        mesh = primitive_mesh(form, np.ones(3))
+        return Shape(
+            self._add_mesh(body, f"{kind}_{number}", mesh, [*colour[:3], 255]), kind, number
+        )
+
+    def _update_shapes(self) -> None:
+        for handle, kind, number in self._shapes:
+            position, orientation, size, colour, form = (
+                getattr(self._model, f"{kind}_{name}")[number]
+                for name in ("pos", "quat", "size", "rgba", "type")
+            )
+            if form == mujoco.mjtGeom.mjGEOM_SPHERE:  # has a radius alone
+                size = np.full(3, size[0])
+            _move(handle, position, orientation)
+            if np.abs(np.asarray(handle.scale) - size).max() > MOVED:
+                handle.scale = tuple(size.tolist())
+            if handle.visible != (is_visible := bool(colour[3] > 0)):
+                handle.visible = is_visible
+
+    def _add_skin(self, skin: int) -> None:
+        model = self._model
         vertices, faces = skin_mesh(model, skin)
         weights = _skin_weights(model, skin)
         first, number = model.skin_boneadr[skin], model.skin_bonenum[skin]
         bones = slice(first, first + number)
         for index, (colour, chosen) in enumerate(colour_patches(skin_colours(model, skin))):
             used, triangles = np.unique(faces[chosen], return_inverse=True)
-            handle = scene.add_mesh_skinned(
-                f"{root}/skin_{skin}_{index}",
+            handle = self._scene.add_mesh_skinned(
+                f"{self._root}/skin_{skin}_{index}",
                 vertices[used],
                 triangles.reshape(-1, 3),
                 bone_wxyzs=model.skin_bonebindquat[bones],
@@ -117,6 +174,14 @@ class ViserScene:
             )
             bodies = model.skin_bonebodyid[bones].tolist()
             self._bones += zip(bodies, handle.bones, strict=True)
+
+
+def _move(handle: Any, position: Floats, orientation: Floats) -> None:
+    """Put a node to a position (3,) m and an orientation (4,) wxyz, if it is not there."""
+    if np.abs(handle.position - position).max() > MOVED:
+        handle.position = position
+    if np.abs(handle.wxyz - orientation).max() > MOVED:
+        handle.wxyz = orientation
 
 
 def _parts(
@@ -148,7 +213,20 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> Floats:
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh:
     """Return a geom's surface in its own frame; without triangles for height fields and SDFs."""
-    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
+    kind = mujoco.mjtGeom(model.geom_type[geom])
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        triangles = slice(
+            model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh]
+        )
+        vertices = model.mesh_vert[first : first + number].astype(np.float64)
+        return Mesh(vertices, model.mesh_face[triangles].astype(np.int64))
+    return primitive_mesh(kind, model.geom_size[geom])
+
+
+def primitive_mesh(kind: mujoco.mjtGeom, size: Floats) -> Mesh:
+    """Return the surface of a shape of MuJoCo's sizes (3,); without triangles for any other."""
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return _box(size)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -162,14 +240,6 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh:
         # Twice each edge, so that light breaks there.
         ends = [[0, -half], [radius, -half], [radius, -half], [radius, half], [radius, half]]
         return _revolved(np.array([*ends, [0, half]]))
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = model.geom_dataid[geom]
-        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        triangles = slice(
-            model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh]
-        )
-        vertices = model.mesh_vert[first : first + number].astype(np.float64)
-        return Mesh(vertices, model.mesh_face[triangles].astype(np.int64))
     if kind == mujoco.mjtGeom.mjGEOM_PLANE:
         x, y = (half or ENDLESS for half in size[:2])
         return Mesh(np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]), _SQUARE)

@@ -116,6 +116,9 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
     }
     task: ClassVar[TaskEntry]
     phase_names: ClassVar[tuple[str, ...]]
+    varying_geoms: ClassVar[tuple[str, ...]] = ()
+    """Starts of names of geoms whose pose on their body and size the task changes, to show
+    something that has no part in the physics."""
 
     def __init__(
         self,

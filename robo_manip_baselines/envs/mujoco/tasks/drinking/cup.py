@@ -41,6 +41,9 @@ SLICES: Final = 10
 DROPS: Final = 7
 """Drops that are seen of a jet."""
 
+SLICE, DROP = "cup/slice_", "cup/drop_"
+"""Starts of the names of their geoms."""
+
 DROP_RADIUS: Final = 0.0022
 """m, of a drop of 45 µl."""
 
@@ -72,9 +75,9 @@ def add_cup(spec: mujoco.MjSpec) -> None:
     _add_solids(body)
     _add_visuals(body)
     for number in range(SLICES):
-        _add_liquid(body, f"cup/slice_{number}", mujoco.mjtGeom.mjGEOM_BOX)
+        _add_liquid(body, f"{SLICE}{number}", mujoco.mjtGeom.mjGEOM_BOX)
     for number in range(DROPS):
-        _add_liquid(body, f"cup/drop_{number}", mujoco.mjtGeom.mjGEOM_SPHERE)
+        _add_liquid(body, f"{DROP}{number}", mujoco.mjtGeom.mjGEOM_SPHERE)
     up = -np.arctan2(SPOUT_AXIS[2], SPOUT_AXIS[0]) / 2
     quat = (np.cos(up), 0.0, np.sin(up), 0.0)
     body.add_site(name="spout", pos=SPOUT_TIP.tolist(), quat=quat, size=(0.002,) * 3, group=4)
@@ -150,8 +153,8 @@ class LiquidView:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        names = [f"slice_{n}" for n in range(SLICES)] + [f"drop_{n}" for n in range(DROPS)]
-        self._geoms = np.array([model.geom(f"cup/{name}").id for name in names])
+        names = [f"{SLICE}{n}" for n in range(SLICES)] + [f"{DROP}{n}" for n in range(DROPS)]
+        self._geoms = np.array([model.geom(name).id for name in names])
         edges = np.linspace(-CAVITY_RADIUS, CAVITY_RADIUS, SLICES + 1)
         self._places = (edges[1:] + edges[:-1]) / 2
         chords = np.sqrt(CAVITY_RADIUS**2 - self._places**2)

@@ -13,7 +13,9 @@ from robo_manip_baselines.envs.mujoco.cell.scene import ARM_BASES, CONTROL_PERIO
 from robo_manip_baselines.envs.mujoco.tasks.drinking import ENTRY
 from robo_manip_baselines.envs.mujoco.tasks.drinking.cup import (
     BODY_HEIGHT,
+    DROP,
     DROPS,
+    SLICE,
     LiquidView,
     add_cup,
 )
@@ -191,6 +193,7 @@ class DrinkingEnv(FaceEnv):
 
     task = ENTRY
     phase_names = tuple(phase.name.lower() for phase in Phase)
+    varying_geoms = (SLICE, DROP)
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
