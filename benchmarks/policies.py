@@ -243,6 +243,20 @@ def require_same_run(config: TrainConfig[Any]) -> None:
         TrainSetup.load(config).find_start(resume=True)  # compares what the folders hold
 
 
+def require_same_delay(out: Path, delay: int) -> None:
+    """Make sure that the runs that are there, which have rows in the same table, have this delay.
+
+    Raises:
+        RequestError: one has another.
+    """
+    for path in sorted((out / "runs").glob(f"*/{CONFIG}")):
+        if (theirs := read_config(path).get("delay", 0)) != delay:
+            raise RequestError(
+                f"'{path.parent}' has delay {theirs}, not {delay}; choose another --out, or give "
+                "the same --delay"
+            )
+
+
 def require_same_seed(episodes: Path, seed: int) -> None:
     """Make sure that an evaluation, if it is there, begins with this seed.
 
@@ -421,6 +435,7 @@ def main() -> None:
         write_text(options.out / TIMES, times_table(options))
         print((options.out / TIMES).read_text("utf-8"))
         return
+    require_same_delay(options.out, options.delay)
     for train_seed in options.train_seeds:
         for observation in options.observations:
             for policy in options.policies:

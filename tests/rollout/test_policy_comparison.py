@@ -106,6 +106,9 @@ def test_other_settings_are_refused(policies: ModuleType, tmp_path: Path) -> Non
     }.items():
         with pytest.raises(RequestError, match=name):
             policies.run(replace(options, **changes), "Mlp", "default", 3)
+    policies.require_same_delay(tmp_path, 0)
+    with pytest.raises(RequestError, match="has delay 0, not 4; choose another --out"):
+        policies.require_same_delay(tmp_path, 4)  # whatever the policies
 
 
 def test_rows_of_earlier_versions_are_measured_again(policies: ModuleType, tmp_path: Path) -> None:
