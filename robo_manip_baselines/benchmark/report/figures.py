@@ -49,7 +49,7 @@ FAILURE_COLORS = (GREY, PINK, BLUE, SKY, RED, ORANGE, YELLOW)
 
 LEAD_COLORS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, INK)
 LEAD_MARKERS = "osD^"
-"""Colors and markers of the curves over net lead, colors changing first."""
+"""Colors and markers of the curves over net lead."""
 
 TIER_COLORS = (SKY, YELLOW, ORANGE, RED, INK)
 """Colors of forces up to each tier, and above the last."""
@@ -524,33 +524,45 @@ def _shows_net_lead(series: Sequence[LeadSeries]) -> bool:
 def draw_net_lead(
     figure: Any, statistics: BenchmarkStatistics, series: Sequence[LeadSeries]
 ) -> tuple[str, str]:
-    """Draw the end point against net lead, one curve for each policy, motion and delay."""
-    figure.set_size_inches(8.0, 4.6)
-    axes = figure.add_subplot()
-    policies = {own.policy for own in series}
+    """Draw the end point against net lead: a panel for each motion, a curve for each delay."""
+    policies, delays = {s.policy for s in series}, sorted({s.delay for s in series})
+    panels: dict[str, list[LeadSeries]] = {}
+    for own in series:
+        title = f"{own.policy}, {own.motion}" if len(policies) > 1 else own.motion
+        panels.setdefault(title, []).append(own)
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    figure.set_size_inches(max(8.0, 3.6 * columns), 1.0 + 3.6 * rows)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    curves: dict[int, Any] = {}
     best: tuple[float, int, str] | None = None
-    for number, own in enumerate(series):
-        label = f"{own.motion}, {own.delay} frames late"
-        label = f"{own.policy}, {label}" if len(policies) > 1 else label
-        leads = sorted(own.points)
-        rates = [statistics.rate(own.points[lead]) for lead in leads]
-        rate, low, high = (
-            100.0 * np.array([(r.rate, r.low, r.high) for r in rates], dtype=np.float64).T
-        )
-        style: Any = {"color": LEAD_COLORS[number % len(LEAD_COLORS)], "label": label}
-        style["fmt"] = f"{LEAD_MARKERS[number // len(LEAD_COLORS) % len(LEAD_MARKERS)]}-"
-        errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
-        shift = 0.06 * (number - (len(series) - 1) / 2)  # bars beside one another
-        axes.errorbar(np.array(leads) + shift, rate, errors, capsize=3, **style)
-        top = max(zip(rate.tolist(), leads, strict=True))
-        best = max(best, (*top, label)) if best else (*top, label)
-    axes.axvline(0.0, color=GREY, lw=1.0, ls=":")
-    ylabel = f"{statistics.end_point}, %"
-    axes.set(
-        xlabel="net lead (horizon − delay), frames of 1/30 s", ylabel=ylabel, ylim=(0.0, 100.0)
-    )
-    axes.grid(axis="y")
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    for axes, (title, shown) in zip(grid.flat, panels.items(), strict=False):
+        axes.set_title(title)
+        axes.axvline(0.0, color=GREY, lw=1.0, ls=":")
+        axes.grid(axis="y")
+        for own in shown:
+            number = delays.index(own.delay)
+            leads = sorted(own.points)
+            rates = [statistics.rate(own.points[lead]) for lead in leads]
+            rate, low, high = (
+                100.0 * np.array([(r.rate, r.low, r.high) for r in rates], dtype=np.float64).T
+            )
+            style: Any = {"color": LEAD_COLORS[number % len(LEAD_COLORS)], "capsize": 3}
+            style["fmt"] = f"{LEAD_MARKERS[number % len(LEAD_MARKERS)]}-"
+            errors = np.maximum([rate - low, high - rate], 0.0)  # not -1e-17
+            shift = 0.06 * (number - (len(delays) - 1) / 2)  # bars beside one another
+            curves[own.delay] = axes.errorbar(np.array(leads) + shift, rate, errors, **style)
+            label = f"{title}, {own.delay} frames late"
+            top = (*max(zip(rate.tolist(), leads, strict=True)), label)
+            best = max(best, top) if best else top
+    grid[0, 0].set_ylim(0.0, 100.0)
+    figure.supxlabel("net lead (horizon − delay), frames of 1/30 s")
+    figure.supylabel(f"{statistics.end_point}, %")
+    names = [f"{delay} frames late" for delay in delays]
+    handles = [curves[delay] for delay in delays]
+    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize=9)
     caption = (
         "The latest target that a policy observes, ahead of the present (right) or behind it: its "
         "latency budget is the delay, and the lag of the arm and the age of the plan come on top. "
