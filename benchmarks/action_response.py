@@ -1,11 +1,12 @@
-"""Response of a policy's actions to the mouth and to the robot's own posture.
+"""Response of a policy's actions to the mouth, to the robot's own posture and to what it holds.
 
-A policy that imitates, and that is shown too little of the mouth, can read its next action off the
-posture of the arm, which in demonstrations is where the demonstrator was going: the copycat problem
+A policy that imitates, and that is shown too little of the mouth, can read its next action off
+where its arm is, which in demonstrations is where the demonstrator was going: the copycat problem
 (Wen et al., "Fighting Copycat Agents in Behavioral Cloning from Observation Histories", NeurIPS
 2020). Its error on demonstrations is small, and it does not follow the mouth. This displaces the
-observed mouth, and then the arm with what it holds, by 5 mm in frames of demonstrations near the
-mouth, and measures the proportion of either displacement by which the actions move.
+observed mouth, then the arm, then the object that the gripper holds, by 5 mm in frames of
+demonstrations near the mouth, and measures the proportion of each displacement by which the actions
+move.
 
     python benchmarks/action_response.py --dataset dyskinetic --checkpoints runs/*/checkpoints/*
 """
@@ -52,7 +53,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Options:
-    """Measure how far the actions of policies follow the mouth, and their own posture."""
+    """Measure how far the actions of policies follow the mouth, the arm and the held object."""
 
     dataset: Path
     """Folder of demonstrations."""
@@ -85,12 +86,14 @@ class Response(NamedTuple):
 
     Attributes:
         mouth: movement of the actions as a proportion of the mouth's displacement: 1 follows it.
-        posture: movement as a proportion of the displacement of arm and held object: 1 copies it.
+        arm: movement as a proportion of the arm's displacement: 1 copies it.
+        held: movement as a proportion of the held object's displacement.
         error: m from the demonstrated actions.
     """
 
     mouth: float
-    posture: float
+    arm: float
+    held: float
     error: float
 
 
@@ -113,18 +116,15 @@ def displaced_mouth(observed: TargetObservation, by: Floats) -> TargetObservatio
 
 
 def displaced_arm(state: State, by: Floats) -> State:
-    """Move the right arm's gripper with what it holds; the wrist's joints stay."""
+    """Move the right arm's gripper; the wrist's joints stay, and so does what it holds."""
     place = state.end_effector_position + by
     joints = state.joint_position.copy()
     joints[:, -1] = joints_at("right", place, joints[:, -1, 3:])
-    objects = state.object_position + by
-    return replace(
-        state, joint_position=joints, end_effector_position=place, object_position=objects
-    )
+    return replace(state, joint_position=joints, end_effector_position=place)
 
 
 def respond(checkpoint: Checkpoint, episodes: list[Recorded], count: int) -> Response:
-    """Displace mouth and arm along each axis, and compare the first ``count`` actions.
+    """Displace mouth, arm and object along each axis, and compare the first ``count`` actions.
 
     Raises:
         RequestError: the policy's actions are not a function of one observed state alone.
@@ -142,9 +142,16 @@ def respond(checkpoint: Checkpoint, episodes: list[Recorded], count: int) -> Res
     if problem := next((text for text, is_there in problems.items() if is_there), None):
         raise RequestError(f"'{checkpoint.folder}' {problem}; choose another checkpoint")
     pipeline = spec.make_pipeline()
-    mouth: list[Floats] = []
-    posture: list[Floats] = []
+    moves: dict[str, list[Floats]] = {"mouth": [], "arm": [], "held": []}
     errors: list[Floats] = []
+
+    def predict(state: State, observed: TargetObservation, rows: NDArray[np.int64]) -> Floats:
+        vector = spec.pack(state, observed if pipeline else None)[rows]
+        normalized = torch.from_numpy(normalization.normalize_state(vector))
+        with torch.inference_mode():
+            chunk = model.predict(normalized[:, None], None, None)[:, :count].numpy()
+        return gripper_position("right", normalization.unnormalize_action(chunk)[..., :6])
+
     for state, action, seed, rows in episodes:
         if not len(rows):
             continue
@@ -152,29 +159,25 @@ def respond(checkpoint: Checkpoint, episodes: list[Recorded], count: int) -> Res
         if pipeline:
             observed = pipeline.observe_episode(state, seed)
 
-        def predict(state: State, observed: TargetObservation) -> Floats:
-            vector = spec.pack(state, observed if pipeline else None)[rows]  # noqa: B023
-            normalized = torch.from_numpy(normalization.normalize_state(vector))
-            with torch.inference_mode():
-                chunk = model.predict(normalized[:, None], None, None)[:, :count].numpy()
-            return gripper_position("right", normalization.unnormalize_action(chunk)[..., :6])
-
-        usual = predict(state, observed)
+        usual = predict(state, observed, rows)
         steps = np.minimum(rows[:, None] + np.arange(usual.shape[1]), len(action) - 1)
         gap = usual - gripper_position("right", action[steps][..., :6])
         errors.append(np.linalg.norm(gap, axis=-1).ravel())
         for axis, by in enumerate(DISPLACEMENT * np.eye(3)):
-            if pipeline:
-                followed = predict(state, displaced_mouth(observed, by))
-            else:
-                moved = replace(state, target_position=state.target_position + by)
-                followed = predict(moved, observed)
-            copied = predict(displaced_arm(state, by), observed)
-            mouth.append((followed - usual)[..., axis].ravel() / DISPLACEMENT)
-            posture.append((copied - usual)[..., axis].ravel() / DISPLACEMENT)
+            moved = replace(state, target_position=state.target_position + by)
+            holding = replace(state, object_position=state.object_position + by)
+            changed = {
+                "mouth": (moved, displaced_mouth(observed, by)),
+                "arm": (displaced_arm(state, by), observed),
+                "held": (holding, observed),
+            }
+            for name, seen in changed.items():
+                change = predict(*seen, rows) - usual
+                moves[name].append(change[..., axis].ravel() / DISPLACEMENT)
     if not errors:
         raise RequestError("no frame near the mouth: the dataset has to be one of feeding")
-    return Response(*(float(np.concatenate(part).mean()) for part in (mouth, posture, errors)))
+    parts = {**moves, "error": errors}
+    return Response(**{name: float(np.concatenate(part).mean()) for name, part in parts.items()})
 
 
 def condition(checkpoint: Checkpoint) -> tuple[str, str, int]:
@@ -194,13 +197,14 @@ def table(responses: dict[tuple[str, str, int], list[Response]]) -> str:
             *name,
             len(own),
             text([r.mouth for r in own], 2),
-            text([r.posture for r in own], 2),
+            text([r.arm for r in own], 2),
+            text([r.held for r in own], 2),
             text([1e3 * r.error for r in own], 1),
         )
         for name, own in responses.items()
     ]
-    head = ("policy", "observation", "steps", "trainings")
-    return markdown_table((*head, "follows the mouth", "follows the arm", "error, mm"), rows)
+    head = ("policy", "observation", "steps", "trainings", "follows the mouth", "the arm")
+    return markdown_table((*head, "the held object", "error, mm"), rows)
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from robo_manip_baselines.data.episode import EpisodeReader, read_metadata
 from robo_manip_baselines.data.files import FAILED_FOLDER, finished_seeds, list_episodes, seed_of
 from robo_manip_baselines.data.schema import POLICY_ATTRIBUTES
 from robo_manip_baselines.envs.mujoco.tasks.registry import without_library_path
-from robo_manip_baselines.observation import ObservationSpec, State
+from robo_manip_baselines.observation import ObservationSpec, ObservedNames, State
 from robo_manip_baselines.observation.corruption import prediction_problem
 from robo_manip_baselines.observation.spec import size_text
 from robo_manip_baselines.runs.documents import convert
@@ -122,6 +122,10 @@ SHOWN = {field.name for field in fields(ObservationSpec)} | {"error"}
 whatever was shown."""
 
 
+CARRIED: Final = 0.01
+"""m from where it lay at the start beyond which an object is carried."""
+
+
 @dataclass(frozen=True)
 class Demonstrations:
     """Episodes one after another, in the order of their seeds.
@@ -164,6 +168,17 @@ class Demonstrations:
         """Return the rows of the episodes of these indices, in their order."""
         ranges = [np.arange(self.offsets[i], self.offsets[i + 1]) for i in episodes]
         return np.concatenate([np.zeros(0, np.int64), *ranges])
+
+    def carried(self, names: ObservedNames) -> NDArray[np.bool_]:
+        """Return which objects have left the place where they lay, at every row (sum T, O).
+
+        None has where they are not observed. ``names`` are the task's.
+        """
+        count = len(names.objects) if self.spec.object_pose else 0
+        part = self.spec.slices(names).get("object_position", slice(0, 0))
+        place = self.state[:, part].reshape(len(self.state), count, 3)
+        start = np.repeat(place[self.offsets[:-1]], self.lengths, axis=0)
+        return np.linalg.norm(place - start, axis=-1) > CARRIED
 
     def indices(self, seeds: Sequence[int]) -> tuple[int, ...]:
         """Return the indices of the episodes of these seeds, in their order.

@@ -85,6 +85,9 @@ class TrainSettings:
         clock_noise: likewise for the time since the start that ``current_pred`` observes, the same
             for all its frames. A policy that can read the clock releases by the clock, whether or
             not it has reached the target.
+        object_noise: standard deviation, m, of the Gaussian noise that is added, in training, to
+            the observed positions of objects that are carried; 0 for none. An object that is held
+            is where the gripper is: without, a policy reads off it what ``state_noise`` hides.
         action_noise: standard deviation of the Gaussian noise that is added, in training, to the
             actions, in units of each element's own (RoboManipBaselines: ``--action_aug_std``).
         intervention_weight: factor of the error of actions that a person chose instead of the
@@ -126,6 +129,7 @@ class TrainSettings:
     steps: Count | None = None
     state_noise: Amount = 0.0
     clock_noise: Amount = 0.0
+    object_noise: Amount = 0.0
     action_noise: Amount = 0.0
     intervention_weight: Annotated[float, Interval(gt=0.0, le=1e6)] = 1.0
     augment: str = "none"

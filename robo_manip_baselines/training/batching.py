@@ -196,6 +196,41 @@ class StateNoise:
         return noise
 
 
+class ObjectNoise:
+    """Gaussian noise on the positions of objects that are carried, in normalised states.
+
+    Args:
+        demonstrations: all episodes.
+        names: of the task's objects.
+        normalization: of the states.
+        std: standard deviation along each axis, m (``TrainSettings.object_noise``).
+    """
+
+    def __init__(
+        self,
+        demonstrations: Demonstrations,
+        names: ObservedNames,
+        normalization: Normalization,
+        std: float,
+    ) -> None:
+        carried = demonstrations.carried(names) if std else np.zeros((0, 0), bool)
+        self._carried = torch.from_numpy(carried.repeat(3, axis=-1))  # (sum T, 3 O)
+        self._part = demonstrations.spec.slices(names).get("object_position", slice(0, 0))
+        self._scale = torch.from_numpy(std / normalization.state_std[self._part])
+        self._size = len(normalization.state_std)
+
+    def __bool__(self) -> bool:
+        return bool(self._carried.any())
+
+    def draw(self, seed: int, step: int, rows: NDArray[np.int64]) -> Tensor:
+        """Return (..., S) for a step, whose observations are the rows (...) of demonstrations."""
+        carried = self._carried[torch.from_numpy(rows)]
+        drawn = step_noise(seed, "object", step, rows.size, carried.shape[-1])
+        noise = torch.zeros(*rows.shape, self._size)
+        noise[..., self._part] = self._scale * drawn.view(carried.shape) * carried
+        return noise
+
+
 def part_of(count: int, rank: int, world_size: int) -> slice:
     """Return a process's part of ``count`` examples: contiguous, as equal as can be."""
     return slice(count * rank // world_size, count * (rank + 1) // world_size)
@@ -225,6 +260,7 @@ class BatchLoader:
         encoding: of the actions; None for targets of the joints.
         skip: control steps between two actions of a chunk, and between observations of a window.
         state_noise: added to states; None for no noise.
+        object_noise: added to states as well; None for no noise.
         action_noise: standard deviation of the noise that is added to normalised actions.
         intervention_weight: of the error of actions that a person chose instead of the policy.
         images: None without cameras. Not closed by the loader.
@@ -251,6 +287,7 @@ class BatchLoader:
         encoding: ActionEncoding | None = None,
         skip: int = 1,
         state_noise: StateNoise | None = None,
+        object_noise: ObjectNoise | None = None,
         action_noise: float = 0.0,
         intervention_weight: float = 1.0,
         images: ImageStore | None = None,
@@ -270,6 +307,7 @@ class BatchLoader:
         require_range("depth", depth, NonNegativeInt)
         self._sampler, self._model, self._seed = sampler, model, seed
         self._state_noise, self._action_noise = state_noise, action_noise
+        self._object_noise = object_noise or None
         self._encoding, self._skip = encoding or None, skip
         self._rank, self._world_size, self._depth = rank, world_size, depth
         self._offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sampler.lengths)])
@@ -337,6 +375,9 @@ class BatchLoader:
         if self._state_noise:
             drawn = self._state_noise.draw(self._seed, step, count * n_obs_steps)
             state_noise = None if drawn is None else drawn.view(count, n_obs_steps, -1)[part]
+        if self._object_noise:
+            added = self._object_noise.draw(self._seed, step, self._rows[windows])[part]
+            state_noise = added if state_noise is None else state_noise + added
         image_changes: ImageChanges | None = None
         if self._augmentation:
             image_changes = self._augmentation.draw(self._seed, step, count).part(part)

@@ -32,7 +32,12 @@ from robo_manip_baselines.runs.metrics import MetricsLog, read_metrics, write_cu
 from robo_manip_baselines.runs.progress import StepProgress
 from robo_manip_baselines.runs.seeds import derive_seed
 from robo_manip_baselines.training.augmentation import ImageAugmentation
-from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise
+from robo_manip_baselines.training.batching import (
+    BatchLoader,
+    ExampleSampler,
+    ObjectNoise,
+    StateNoise,
+)
 from robo_manip_baselines.training.config import CURVES, METRICS, RUN, TrainConfig
 from robo_manip_baselines.training.device import (
     Processes,
@@ -244,6 +249,7 @@ class Trainer:
             encoding=setup.encoding,
             skip=settings.skip,
             state_noise=noise,
+            object_noise=ObjectNoise(given, names, setup.normalization, settings.object_noise),
             action_noise=settings.action_noise,
             intervention_weight=settings.intervention_weight,
             images=images,

@@ -100,7 +100,27 @@ def test_the_proportions_of_a_known_policy(
     monkeypatch.setattr(script, "load_model", lambda _: Known(spec, proportion))
     found = script.respond(checkpoint(spec), [recorded(script)], 4)
     assert found.mouth == pytest.approx(proportion, abs=1e-3)
-    assert found.posture == pytest.approx(1.0 - proportion, abs=1e-3)
+    assert found.arm == pytest.approx(1.0 - proportion, abs=1e-3)
+    assert found.held == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_policy_that_copies_what_it_holds(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = ObservationSpec("current", cameras=(), object_pose=True)
+
+    class Copycat(Known):
+        def predict(self, state: torch.Tensor, images: None, noise: None) -> torch.Tensor:
+            action = super().predict(state, images, noise)
+            cube = state[:, 0, self.spec.slices(NAMES)["object_position"]].numpy()
+            reached = joints_at("right", cube.astype(np.float64), np.tile(WRIST, (len(cube), 1)))
+            action[..., :6] = torch.from_numpy(reached.astype(np.float32))[:, None]
+            return action
+
+    monkeypatch.setattr(script, "load_model", lambda _: Copycat(spec, 0.5))
+    found = script.respond(checkpoint(spec), [recorded(script)], 4)
+    assert (found.mouth, found.arm) == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert found.held == pytest.approx(1.0, abs=1e-3)
 
 
 def test_the_error_is_that_of_a_policy_that_stays(
@@ -164,12 +184,12 @@ def test_demonstrations_without_a_step_near_the_mouth_are_refused(
 def test_trainings_of_a_condition_are_one_row(script: ModuleType) -> None:
     name, other = ("Mlp", "current", 1000), ("Mlp", "current", 6000)
     responses = {
-        name: [script.Response(0.2, 0.7, 0.009), script.Response(0.3, 0.6, 0.011)],
-        other: [script.Response(0.1, 0.85, 0.004)],
+        name: [script.Response(0.2, 0.1, 0.7, 0.009), script.Response(0.3, 0.1, 0.6, 0.011)],
+        other: [script.Response(0.1, 0.05, 0.85, 0.004)],
     }
     last = script.table(responses).splitlines()[-2:]
     assert last == [
-        "| Mlp | current | 1000 | 2 | 0.25 (0.20 to 0.30) | 0.65 (0.60 to 0.70) | "
+        "| Mlp | current | 1000 | 2 | 0.25 (0.20 to 0.30) | 0.10 | 0.65 (0.60 to 0.70) | "
         "10.0 (9.0 to 11.0) |",
-        "| Mlp | current | 6000 | 1 | 0.10 | 0.85 | 4.0 |",
+        "| Mlp | current | 6000 | 1 | 0.10 | 0.05 | 0.85 | 4.0 |",
     ]

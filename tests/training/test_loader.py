@@ -22,7 +22,13 @@ from robo_manip_baselines.observation import ObservationSpec, ObservedNames
 from robo_manip_baselines.policy.interface import Batch, PolicyModel
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.training.augmentation import ImageAugmentation, change_images
-from robo_manip_baselines.training.batching import BatchLoader, ExampleSampler, StateNoise, part_of
+from robo_manip_baselines.training.batching import (
+    BatchLoader,
+    ExampleSampler,
+    ObjectNoise,
+    StateNoise,
+    part_of,
+)
 from robo_manip_baselines.training.images import ImageStore
 
 LENGTHS = (6, 9, 4, 7, 5)
@@ -345,3 +351,64 @@ def test_a_gpu_gets_the_same_vectors(blind: Demonstrations, depth: int, noise_si
     there = make_loader(blind, depth=depth, device="cuda:0", noise_size=noise_size)
     for step, batch in enumerate(copies(there, 60)):
         assert_equal(batch, here.batch(step))
+
+
+CUBE = ObservedNames(objects=("cube",))
+
+
+@pytest.fixture(scope="module")
+def carrying(tmp_path_factory: pytest.TempPathFactory) -> Demonstrations:
+    """Episodes whose cube rises by 4 mm a step, after it has lain for two."""
+    folder = tmp_path_factory.mktemp("carrying")
+    for seed, steps in enumerate(LENGTHS):
+        arrays = make_arrays(steps, seed)
+        arrays["object_pose"][:, :3] = arrays["object_pose"][0, :3]
+        arrays["object_pose"][:, 2] += 0.004 * np.maximum(np.arange(steps) - 2, 0)
+        write_episode(episode_path(folder, seed, success=True), arrays, {}, make_attributes(seed))
+    return load_demonstrations(folder, ObservationSpec("current", cameras=(), object_pose=True))
+
+
+def test_an_object_is_carried_from_a_centimetre_on(carrying: Demonstrations) -> None:
+    expected = [step >= 5 for steps in LENGTHS for step in range(steps)]  # 12 mm
+    assert carrying.carried(CUBE)[:, 0].tolist() == expected
+    hidden = replace(carrying, spec=replace(carrying.spec, object_pose=False))
+    assert hidden.carried(CUBE).shape == (sum(LENGTHS), 0)
+
+
+def test_only_carried_objects_have_noise(carrying: Demonstrations) -> None:
+    scale = statistics(carrying)
+    noise = ObjectNoise(carrying, CUBE, scale, 0.02)
+    rows = np.arange(sum(LENGTHS))[:, None].repeat(2000, axis=1)
+    metres = noise.draw(3, 7, rows).numpy() * scale.state_std
+    assert (metres[..., :-3] == 0.0).all()
+    carried = carrying.carried(CUBE)[:, 0]
+    assert (metres[~carried] == 0.0).all()
+    # 22 000 numbers an axis; five times their standard error.
+    assert np.abs(metres[carried][..., -3:].std(axis=(0, 1)) - 0.02).max() < 0.0005
+    assert torch.equal(noise.draw(3, 7, rows), noise.draw(3, 7, rows))
+    assert not torch.equal(noise.draw(3, 8, rows), noise.draw(3, 7, rows))
+    assert not ObjectNoise(carrying, CUBE, scale, 0.0)
+
+
+@pytest.mark.parametrize("world_size", [1, 3])
+def test_noise_of_objects_is_shared_out(carrying: Demonstrations, world_size: int) -> None:
+    scale = statistics(carrying)
+    given = {
+        "object_noise": ObjectNoise(carrying, CUBE, scale, 0.02),
+        "state_noise": StateNoise(carrying.spec, CUBE, robot=0.3),
+        "n_obs_steps": 2,
+    }
+    whole, plain = make_loader(carrying, **given), make_loader(carrying, n_obs_steps=2)
+    parts = [
+        make_loader(carrying, rank=rank, world_size=world_size, **given)
+        for rank in range(world_size)
+    ]
+    changed = 0
+    for step in range(6):
+        expected = whole.batch(step)
+        joined = torch.cat([loader.batch(step).state for loader in parts])
+        assert torch.equal(joined, expected.state)
+        difference = (expected.state - plain.batch(step).state)[..., -3:]
+        changed += int((difference != 0).any(-1).sum())
+        assert torch.equal(expected.action, plain.batch(step).action)
+    assert 0 < changed < 6 * 4 * 2

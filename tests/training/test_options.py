@@ -174,6 +174,7 @@ epochs: null
 steps: 9
 state_noise: 0.2
 clock_noise: 0.5
+object_noise: 0.0
 validation_fraction: 0.0
 ema_decay: 0.999
 precision: auto

@@ -558,11 +558,11 @@ def draw_net_lead(
             top = (*max(zip(rate.tolist(), leads, strict=True)), label)
             best = max(best, top) if best else top
     grid[0, 0].set_ylim(0.0, 100.0)
-    figure.supxlabel("net lead (horizon − delay), frames of 1/30 s")
-    figure.supylabel(f"{statistics.end_point}, %")
+    figure.supxlabel("net lead (horizon − delay), frames of 1/30 s", fontsize=10)
+    figure.supylabel(f"{statistics.end_point}, %", fontsize=10)
     names = [f"{delay} frames late" for delay in delays]
     handles = [curves[delay] for delay in delays]
-    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize=9)
+    figure.legend(handles, names, loc="outside upper center", ncols=4, fontsize=9)
     caption = (
         "The latest target that a policy observes, ahead of the present (right) or behind it: its "
         "latency budget is the delay, and the lag of the arm and the age of the plan come on top. "
