@@ -285,7 +285,7 @@ class Plan:
         if preset.cameras and preset.device == "cpu":
             config = replace(config, training=_with_one_precision(config.training))
         run = PlannedRun(condition, train_seed, None, ())
-        settings = {"config": config.to_json()}
+        settings = {"config": config.to_document()}
         training = self._item("training", run.name, "run_training", settings, files)
         training = replace(training, needs=demonstrations)
         run = replace(run, training=training)

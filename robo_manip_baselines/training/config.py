@@ -51,6 +51,9 @@ EXTENDING_OPTIONS = BUDGET_OPTIONS | {"early_stopping"}
 _PARTS = ("network", "training", "spec")
 """Attributes of the configuration whose fields are options."""
 
+_NEWER = {"object_noise": 0.0}
+"""Options that earlier releases had not, and the value that does what these did."""
+
 _CORRUPTION = {
     "corruption_seed" if item.name == "seed" else item.name: item.name
     for item in fields(Corruption)
@@ -175,6 +178,13 @@ class TrainConfig(Generic[Network]):
         values["image_size"] = size_text(self.spec.image_size)
         return {name: _plain(value) for name, value in values.items()}
 
+    def to_document(self) -> dict[str, Any]:
+        """Return `to_json` for files: without options that earlier releases had not, where unused.
+
+        So that runs and work items of these releases stay those of the same settings.
+        """
+        return {n: v for n, v in self.to_json().items() if n not in _NEWER or v != _NEWER[n]}
+
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> TrainConfig[Any]:
         """Undo `to_json`; settings that are missing have the defaults of the preset.
@@ -231,7 +241,7 @@ def write_config(run: Path, config: TrainConfig[Any]) -> None:
 def _to_yaml(config: TrainConfig[Any]) -> str:
     import yaml  # slow to import
 
-    values = {name: value for name, value in config.to_json().items() if name != "out"}
+    values = {name: value for name, value in config.to_document().items() if name != "out"}
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
 

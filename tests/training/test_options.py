@@ -10,7 +10,7 @@ import yaml
 from robo_manip_baselines.commands.train import parse_config
 from robo_manip_baselines.policy.act.config import PRESETS, ActConfig
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.training.config import TrainConfig, require_same_config
+from robo_manip_baselines.training.config import TrainConfig, require_same_config, write_config
 
 
 def parse(line: str, *, has_gpu: bool = False) -> TrainConfig[ActConfig]:
@@ -174,7 +174,6 @@ epochs: null
 steps: 9
 state_noise: 0.2
 clock_noise: 0.5
-object_noise: 0.0
 validation_fraction: 0.0
 ema_decay: 0.999
 precision: auto
@@ -210,6 +209,22 @@ checkpoint_every: 1000
     resumed = parse(f"Act --out {tmp_path} --resume")
     assert resumed.to_json() == {**given.to_json(), "out": str(tmp_path)}
     require_same_config(tmp_path, given)
+
+
+def test_an_option_that_earlier_releases_had_not_is_written_where_it_is_used(
+    tmp_path: Path,
+) -> None:
+    off, on = parse("Mlp --preset cpu"), parse("Mlp --preset cpu --object_noise 0.05")
+    assert off.training.object_noise == 0.0
+    assert "object_noise" not in off.to_document()
+    assert on.to_document() == {**off.to_document(), "object_noise": 0.05}
+    write_config(tmp_path, off)
+    assert "object_noise" not in (tmp_path / "config.yaml").read_text()
+    require_same_config(tmp_path, off)
+    with pytest.raises(RequestError, match=r"a run with object_noise 0\.0, not 0\.05"):
+        require_same_config(tmp_path, on)
+    write_config(tmp_path, on)
+    assert parse(f"Mlp --out {tmp_path} --resume").training.object_noise == 0.05
 
 
 @pytest.mark.parametrize(
