@@ -375,7 +375,7 @@ class BatchLoader:
         if self._state_noise:
             drawn = self._state_noise.draw(self._seed, step, count * n_obs_steps)
             state_noise = None if drawn is None else drawn.view(count, n_obs_steps, -1)[part]
-        if self._object_noise:
+        if self._object_noise is not None:
             added = self._object_noise.draw(self._seed, step, self._rows[windows])[part]
             state_noise = added if state_noise is None else state_noise + added
         image_changes: ImageChanges | None = None

@@ -52,7 +52,7 @@ _PARTS = ("network", "training", "spec")
 """Attributes of the configuration whose fields are options."""
 
 _NEWER = {"object_noise": 0.0}
-"""Options that earlier releases had not, and the value that does what these did."""
+"""Options that earlier releases had not; the value, that of presets, does what these did."""
 
 _CORRUPTION = {
     "corruption_seed" if item.name == "seed" else item.name: item.name
