@@ -347,6 +347,7 @@ def _forecaster(
     with EpisodeReader(path) as episode:
         episode.task.require_forecasts(spec)
         made = MotionForecasters.of_kwargs(episode.attributes["env_kwargs"])
+        made.require(name)
     return lambda track, seed: made.forecast_track(name, track, seed)
 
 

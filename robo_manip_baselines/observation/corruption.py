@@ -41,7 +41,10 @@ MEASURED_ERRORS = tuple(DRAWN_ERRORS)
 ERRORS = ("none", *MEASURED_ERRORS, "model")
 """Errors of the forecast; ``model`` is the recorded output of a trained predictor."""
 
-FORECASTERS = ("persistence", "constant_velocity", "autoregression", "kalman", "shuffled")
+FORECASTERS = (
+    *("persistence", "constant_velocity", "autoregression", "kalman", "residual"),
+    "shuffled",
+)
 """Forecasters that know the past of the target alone; ``shuffled`` is a control."""
 
 PREDICTIONS = ("truth", *FORECASTERS)
@@ -84,7 +87,8 @@ class Corruption:
         seed: Seed of errors and losses, beside that of the episode.
         prediction: Forecast of the target: truth (its true future), or that of a forecaster, made
             at each control step of the target until then: persistence, constant_velocity,
-            autoregression, kalman or shuffled (motion of another episode).
+            autoregression, kalman, residual (fitted to the motion) or shuffled (motion of another
+            episode).
 
     Raises:
         RequestError: a value is not valid.

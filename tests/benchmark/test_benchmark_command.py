@@ -142,7 +142,7 @@ def test_a_condition_that_cannot_be_had_is_left_out_unless_it_is_named(
         plan_of(options(f"feeding --conditions current_pred_h2_model --motion_library {bare}"))
     assert len(plan_of(options(f"feeding --motion_library {DEFAULT_LIBRARY}")).conditions) == 16
     late = plan_of(options(f"foresight_policies --motion_library {bare}")).conditions
-    assert len(late) == 31  # others than `residual` of the library
+    assert len(late) == 35  # others than `residual` of the library
 
 
 def test_a_budget_takes_the_place_of_another_one_and_a_device_of_its_share() -> None:

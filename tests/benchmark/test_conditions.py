@@ -67,9 +67,9 @@ def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> No
         cell = c.motion, corruption.delay
         cells.setdefault(cell, []).append(shown)
         assert c.name == f"{c.motion}_delay{corruption.delay}_{shown}"
-    shown_of_each = ["current", "history", "truth", "persistence", "autoregression"]
+    shown_of_each = ["current", "history", "truth", "persistence", "autoregression", "residual"]
     assert cells == {
-        (motion, delay): shown_of_each + ["residual"] * (motion == "recorded")
+        (motion, delay): shown_of_each
         for motion in ("dyskinetic", "sway", "recorded")
         for delay in (4, 8)
     }
@@ -183,7 +183,7 @@ def test_a_motion_is_a_name_a_mapping_or_a_list(given: object, text: str) -> Non
         ("- {name: a, obs: baseline, delay: 2}", ["line 3", "baseline"]),
         ("- {name: a, policy: Atc}", ["line 3", "did you mean 'Act'"]),
         ("- {name: a, expert: quick}", ["line 3", "anticipatory, reactive"]),
-        ("- {name: a, prediction: frozen}", ["line 3", "model, persistence, shuffled, truth"]),
+        ("- {name: a, prediction: frozen}", ["line 3", "residual, shuffled, truth"]),
         ("- {name: a, prediction: 3}", ["line 3", "prediction '3'"]),
         ("- {name: a, prediction: shuffled, error: uniform}", ["line 3", "without an error"]),
         ("- {name: a, prediction: model, error: uniform}", ["line 3", "without an error"]),

@@ -17,7 +17,7 @@ from face_prediction.tracking import detector
 from face_prediction.tracking.geometry import Crop
 from robo_manip_baselines.envs.mujoco.cell.rendering import project
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE
-from robo_manip_baselines.envs.mujoco.face import camera_mouth
+from robo_manip_baselines.envs.mujoco.face import camera_mouth, perception
 from robo_manip_baselines.envs.mujoco.face.camera_mouth import CAMERA, IMAGE_SIZE
 from robo_manip_baselines.envs.mujoco.face.model import rotate
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv, world_of
@@ -295,7 +295,7 @@ def test_wrong_requests_are_refused(kwargs: dict[str, Any], message: str) -> Non
 
 
 def test_a_missing_tracker_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_mouth, "TRACKER", "no_such_package.mouth:open_tracker")
+    monkeypatch.setattr(perception, "TRACKER", "no_such_package.mouth:open_tracker")
     with pytest.raises(RequestError, match="mouth_source camera: its tracker cannot be imported"):
         make_env("FeedingEnv", **BLIND, mouth_source="camera")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import subprocess
 import sys
@@ -15,10 +16,12 @@ import pytest
 
 from robo_manip_baselines.data.demonstrations import load_demonstrations
 from robo_manip_baselines.data.episode import EpisodeReader
+from robo_manip_baselines.envs.mujoco.face import perception
 from robo_manip_baselines.envs.mujoco.face.forecasters import (
     FIT_EPISODES,
     LINEAR,
     MotionForecasters,
+    follow_track,
     frames_seen,
 )
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
@@ -221,7 +224,7 @@ def test_errors_are_those_of_the_shown_motion() -> None:
 def test_an_autoregression_forecasts_what_is_computed() -> None:
     """On people whom it was not fitted to, once it has seen as many frames as it uses."""
     made = forecasters("dyskinetic", "test")
-    squares: dict[str, list[float]] = {name: [] for name in LINEAR}
+    squares: dict[str, list[float]] = {name: [] for name in (*LINEAR, "residual")}
     for seed in range(1000, 1006):
         rng = np.random.default_rng(seed)
         path = made.motion.draw(rng, made.library, seed=seed, people="test").displacement_at
@@ -230,7 +233,9 @@ def test_an_autoregression_forecasts_what_is_computed() -> None:
             error = made.forecast_track(name, track, seed) - track[:, 1:]
             own.append(float((error[40:, 11] ** 2).mean()))
     mean = {name: np.mean(own) for name, own in squares.items()}
-    assert all(mean["autoregression"] < 0.1 * mean[n] for n in mean if n != "autoregression")
+    fitted = ("autoregression", "residual")
+    assert all(mean["autoregression"] < 0.1 * mean[n] for n in mean if n not in fitted)
+    assert mean["autoregression"] < mean["residual"] < 0.5 * mean["persistence"]
 
 
 def test_shuffled_has_the_motion_of_another_episode() -> None:
@@ -268,6 +273,8 @@ from robo_manip_baselines.envs.mujoco.face.forecasters import MotionForecasters
 made = MotionForecasters.of_kwargs({"motion": "dyskinetic", "people": "train"})
 for name in ("autoregression", "kalman"):
     print(hashlib.sha256(made.linear(name).weights.tobytes()).hexdigest())
+track = made.paths()[0, :240].reshape(60, 4, 3)  # any numbers, of which four are known at a time
+print(hashlib.sha256(made.forecast_track("residual", track, 0).tobytes()).hexdigest())
 """
 
 
@@ -285,8 +292,52 @@ def test_fits_are_the_same_in_every_process(threads: str) -> None:
     made = forecasters("dyskinetic", "test")
     names = ("autoregression", "kalman")
     here = [made.linear(name).weights for name in names]
-    wanted = [hashlib.sha256(weights.tobytes()).hexdigest() for weights in here]
+    here.append(made.forecast_track("residual", made.paths()[0, :240].reshape(60, 4, 3), 0))
+    wanted = [hashlib.sha256(numbers.tobytes()).hexdigest() for numbers in here]
     assert result.stdout.split() == wanted
+
+
+def test_a_predictor_takes_in_frames_and_forecasts_at_control_steps() -> None:
+    class Predictor:
+        recent = 3
+
+        def __init__(self) -> None:
+            self.taken: list[np.ndarray] = []
+            self.asked: list[tuple[int, np.ndarray]] = []
+
+        def follow(self) -> Predictor:
+            return self
+
+        def update(self, mouth: np.ndarray) -> None:
+            self.taken.append(mouth)
+
+        def forecast(self, recent: np.ndarray, horizon: int) -> np.ndarray:
+            self.asked.append((len(self.taken), recent))
+            return np.full((horizon, 3), float(len(self.asked)))
+
+    path, predictor = motion_of("dyskinetic"), Predictor()
+    made = follow_track(predictor, track_of(path, 101))
+    np.testing.assert_array_equal(made[:, 0, 0], np.arange(1, 102))
+    frames = np.arange(61) * FRAME_PERIOD  # until 2 s
+    np.testing.assert_allclose(predictor.taken, path(frames), atol=EXACT)
+    for step, (taken, recent) in enumerate(predictor.asked):
+        assert taken == math.floor(step * 0.02 / FRAME_PERIOD + 1e-6) + 1
+        then = step * 0.02 - np.array([2, 1, 0]) * FRAME_PERIOD
+        np.testing.assert_allclose(recent, path(np.maximum(then, 0.0)), atol=EXACT)
+
+
+def test_residual_without_its_package_is_refused_before_any_work(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(perception, "PATH_PREDICTOR", "no_such_package.paths:fit")
+    corruption = Corruption(prediction="residual")
+    spec = ObservationSpec("current_pred", 8, cameras=(), corruption=corruption)
+    for opened in (
+        lambda: make_env("FeedingEnv", **spec.env_kwargs()),
+        lambda: load_demonstrations(recorded, spec),
+    ):
+        with pytest.raises(RequestError, match=r"prediction residual: .*face-prediction"):
+            opened()
 
 
 def test_without_a_seed_forecasts_go_with_the_episode() -> None:

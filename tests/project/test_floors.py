@@ -92,14 +92,14 @@ def test_the_packages_meet_in_files_and_in_runs(repository: Path) -> None:
         assert not any(name.split(".")[0] == "face_prediction" for name in names), path
 
 
-def test_one_module_names_the_tracker_of_the_other_package(repository: Path) -> None:
+def test_one_module_names_what_is_of_the_other_package(repository: Path) -> None:
     """A reference ``module:name`` is imported when it is used (docs/decisions/0014)."""
     found = {
         path.relative_to(repository).as_posix()
         for path in (repository / "robo_manip_baselines").rglob("*.py")
         if re.search(r"[\"']face_prediction[.:]", path.read_text(encoding="utf-8"))
     }
-    assert found == {"robo_manip_baselines/envs/mujoco/face/camera_mouth.py"}
+    assert found == {"robo_manip_baselines/envs/mujoco/face/perception.py"}
 
 
 def test_runs_know_no_faces_and_no_robots(repository: Path) -> None:

@@ -38,7 +38,6 @@ from face_prediction.models.residual.experts import (
     slow_means,
 )
 from face_prediction.models.residual.intervals import (
-    LEVELS,
     SIGNS,
     IntervalFit,
     measure_intervals,
@@ -248,16 +247,15 @@ def fit_residual(tracks: Sequence[NDArray[np.floating]], subjects: Sequence[str]
     basis = shapes_of(shown)
     series = [face_series(track, basis) for track in shown]
     people = fit_people(series, subjects)
-    blank = IntervalFit(
-        np.zeros((len(HORIZONS), 2, SIGNS + 1)), np.zeros((len(HORIZONS), 2, len(LEVELS)))
-    )
     made: list[Floats] = [np.empty(0)] * len(series)
     mixed: list[Floats] = [np.empty(0)] * len(series)
     for part in range(2):
         own, others = (np.flatnonzero((half == part) == same).tolist() for same in (True, False))
         fit = fit_people([series[i] for i in others], [subjects[i] for i in others])
         fit = replace(fit, usual=people.usual, pace=people.pace)
-        tried = trial(ResidualFit(basis, fit, blank), [series[i][:_MEASURED] for i in own])
+        tried = trial(
+            ResidualFit(basis, fit, IntervalFit.unknown()), [series[i][:_MEASURED] for i in own]
+        )
         for number, (experts, mixture) in zip(own, tried, strict=True):
             made[number], mixed[number] = experts, mixture
     measured = [track[:_MEASURED] for track in series]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from face_prediction.models.residual.adaptive import Ring
+from face_prediction.models.residual.adaptive import HORIZONS, Ring
 from face_prediction.models.residual.experts import Floats
 
 SIGNS = 4
@@ -48,6 +48,12 @@ class IntervalFit:
         """Logarithms (..., H, 2) of the sizes of errors, from signs (..., H, S)."""
         slopes = self.size[..., :-1]
         return np.einsum("...hs,has->...ha", signs, slopes) + self.size[..., -1]
+
+    @classmethod
+    def unknown(cls) -> IntervalFit:
+        """Return one for forecasts whose intervals are not used."""
+        count = len(HORIZONS)
+        return cls(np.zeros((count, 2, SIGNS + 1)), np.zeros((count, 2, len(LEVELS))))
 
     def until(self, count: int) -> IntervalFit:
         """Return the part of the first ``count`` horizons."""

@@ -157,7 +157,7 @@ class FollowedFaces:
         self._intervals = IntervalTracker(
             fit.intervals.until(len(self.knots)), faces, int(self.knots[-1])
         )
-        self._frames = np.arange(1, horizon + 1)
+        self._horizon = horizon
 
     def keep(self, faces: int) -> None:
         """Go on with the first so many faces."""
@@ -182,21 +182,26 @@ class FollowedFaces:
 
     def moved(self, forecast: StateForecast) -> Floats:
         """Displacements (B, H, D) of every frame ahead."""
-        return self._every_frame(forecast.moved)
+        return every_frame(forecast.moved, self.knots, self._horizon)
 
     def student_t(self, forecast: StateForecast) -> tuple[Floats, Floats]:
         """Scale and degrees of freedom (B, H, 2) of the mouth's error in every frame ahead."""
         scale, freedom = self._intervals.student_t(forecast.signs)
-        return self._every_frame(scale), self._every_frame(freedom)
+        return (
+            every_frame(scale, self.knots, self._horizon),
+            every_frame(freedom, self.knots, self._horizon),
+        )
 
-    def _every_frame(self, values: Floats) -> Floats:
-        """Values (B, H, ...) at every frame ahead, linear between those at the knots."""
-        after = np.searchsorted(self.knots, self._frames)
-        before = np.maximum(after - 1, 0)
-        width = np.maximum(self.knots[after] - self.knots[before], 1)
-        share = 1 - (self.knots[after] - self._frames) / width
-        share = share.reshape(-1, *[1] * (values.ndim - 2))
-        return (1 - share) * values[:, before] + share * values[:, after]
+
+def every_frame(values: Floats, knots: NDArray[np.int64], horizon: int) -> Floats:
+    """Values (B, H, ...) in every frame ahead, linear between those (B, K, ...) at knots (K,)."""
+    frames = np.arange(1, horizon + 1)
+    after = np.searchsorted(knots, frames)
+    before = np.maximum(after - 1, 0)
+    width = np.maximum(knots[after] - knots[before], 1)
+    share = 1 - (knots[after] - frames) / width
+    share = share.reshape(-1, *[1] * (values.ndim - 2))
+    return (1 - share) * values[:, before] + share * values[:, after]
 
 
 class ResidualPredictor:

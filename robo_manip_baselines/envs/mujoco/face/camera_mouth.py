@@ -1,20 +1,13 @@
 """The mouth as the camera ``front_close`` sees it: images, a tracker, reports that come late.
 
-The tracker is another package's: it is named here as ``module:callable`` and imported when a
-`CameraMouth` is made, so that an environment that shows the truth needs no detector
-(``docs/decisions/0014-perception-by-name.md``).
-
 Camera frame: x right in the image, y up, the camera looks along -z; metres.
 """
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import entry_points
-from typing import NoReturn, Protocol
+from typing import NoReturn
 
 import mujoco
 import numpy as np
@@ -22,6 +15,7 @@ from numpy.typing import NDArray
 
 from robo_manip_baselines.envs.mujoco.cell.rendering import CameraRenderer
 from robo_manip_baselines.envs.mujoco.cell.scene import MOUTH_BASE, TIMESTEP
+from robo_manip_baselines.envs.mujoco.face.perception import OpenTracker, find_tracker
 from robo_manip_baselines.observation import (
     FRAME_PERIOD,
     FRAME_RATE,
@@ -30,7 +24,6 @@ from robo_manip_baselines.observation import (
 )
 from robo_manip_baselines.observation.spec import CameraLatency
 from robo_manip_baselines.runs.errors import RequestError
-from robo_manip_baselines.runs.extras import install_command
 
 Floats = NDArray[np.float64]
 
@@ -40,56 +33,8 @@ CAMERA = "front_close"
 IMAGE_SIZE = (480, 640)
 """Height and width of its images in pixels (paper, section IV.C)."""
 
-TRACKER = "face_prediction.live.mouth:open_tracker"
-"""``module:callable`` that opens the `MouthTracker`; an entry point ``mouth_tracker`` of the group
-``robo_manip_baselines.perception`` takes its place."""
-
 _TIME_ROUNDING = 1e-7
 """s by which times that are meant to be the same may differ."""
-
-
-class MouthTracker(Protocol):
-    """Source of the mouth from images one after another."""
-
-    def reset(self) -> None:
-        """Forget everything: the next image is of another scene."""
-        ...
-
-    def update(
-        self, image: NDArray[np.uint8], time: float, depth: NDArray[np.float32] | None = None
-    ) -> Floats | None:
-        """Take in an image (H, W, 3) of ``time`` s, and its depth (H, W) m along the view.
-
-        Returns (K, 3) m, camera frame: the mouth in the image and 1 ... K - 1 frames of 1/30 s
-        after it; None where no face was found.
-        """
-        ...
-
-    def close(self) -> None:
-        """Free what it holds."""
-        ...
-
-
-OpenTracker = Callable[[float, int], MouthTracker]
-"""Opens a tracker, given the camera's vertical field of view (degrees) and the frames ahead."""
-
-
-def find_tracker() -> OpenTracker:
-    """Return what opens the tracker.
-
-    Raises:
-        RequestError: its package is missing.
-    """
-    points = entry_points(group="robo_manip_baselines.perception", name="mouth_tracker")
-    reference = next(iter(points)).value if points else TRACKER
-    module, _, name = reference.partition(":")
-    try:
-        return getattr(import_module(module), name)
-    except ImportError as error:
-        raise RequestError(
-            f"mouth_source camera: its tracker cannot be imported ({error}); run: "
-            f"{install_command('face-prediction')}"
-        ) from None
 
 
 @dataclass(frozen=True)

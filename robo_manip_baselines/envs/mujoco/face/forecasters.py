@@ -1,10 +1,11 @@
 """Causal forecasters of the mouth, and a control that knows nothing of it.
 
-They know the mouth in video frames of 1/30 s up to the newest one seen, without noise. All but
-``shuffled``, which moves as in another episode, are linear: a matrix of weights for each horizon,
-applied to the frames seen. Autoregressions and the Kalman filter are fitted, for each motion, to
-episodes that neither demonstrations nor evaluations use; of recorded motion these are other starts
-in the same recordings, and with people apart, in those of the people of demonstrations.
+They know the mouth in video frames of 1/30 s up to the newest one seen, without noise. All but two
+are linear: a matrix of weights for each horizon, applied to the frames seen. ``residual`` is a
+predictor that keeps learning from the mouth that it follows, of another package (`perception`), and
+``shuffled`` moves as in another episode. What is fitted, is fitted for each motion to episodes that
+neither demonstrations nor evaluations use; of recorded motion these are other starts in the same
+recordings, and with people apart, in those of the people of demonstrations.
 
 Legend: H frames ahead at most, N frames seen, E episodes, T frames of a path or control steps of an
 episode, K frames from now to the longest one known, D state.
@@ -28,6 +29,7 @@ from robo_manip_baselines.envs.mujoco.face.motion import (
     MotionSegment,
 )
 from robo_manip_baselines.envs.mujoco.face.motions import FaceMotion, parse_motion
+from robo_manip_baselines.envs.mujoco.face.perception import PathPredictor, find_path_predictor
 from robo_manip_baselines.envs.mujoco.face.replay import FRAMES_AHEAD
 from robo_manip_baselines.observation import FORECASTERS, FRAME_PERIOD, MAX_HORIZON
 from robo_manip_baselines.runs.autoregression import forecast, moments, solve
@@ -276,9 +278,12 @@ class MotionForecasters:
             seed: of the episode.
 
         Raises:
-            RequestError: there is no such forecaster.
+            RequestError: there is no such forecaster, or its package is missing.
         """
-        if require_choice("forecaster", name, FORECASTERS) == "shuffled":
+        require_choice("forecaster", name, FORECASTERS)
+        if name == "residual":
+            made = follow_track(_fitted_predictor(self), track)
+        elif name == "shuffled":
             time = _step_times(len(track)) + FRAMES_AHEAD
             other = self.another_episode(seed).displacement_at(time)
             made = track[:, :1] + other[:, 1:] - other[:, :1]
@@ -292,6 +297,15 @@ class MotionForecasters:
             made[is_early] = track[is_early, :1]
         # The face stands still after its motion, and so does the forecast.
         return made[np.minimum(np.arange(len(track)), round(SEGMENT_DURATION / CONTROL_PERIOD))]
+
+    def require(self, name: str) -> None:
+        """Require what a forecaster needs.
+
+        Raises:
+            RequestError: its package is missing.
+        """
+        if name == "residual":
+            find_path_predictor()
 
     def _draw(self, seed: int) -> MotionSegment:
         rng = np.random.default_rng(seed)
@@ -310,6 +324,31 @@ LINEAR: Mapping[str, Callable[[MotionForecasters], LinearForecaster]] = {
 @cache
 def _fitted(name: str, forecasters: MotionForecasters) -> LinearForecaster:
     return LINEAR[name](forecasters)
+
+
+@cache
+def _fitted_predictor(forecasters: MotionForecasters) -> PathPredictor:
+    return find_path_predictor()(forecasters.paths())
+
+
+def follow_track(predictor: PathPredictor, track: Floats) -> Floats:
+    """Return the forecasts, (T, H, 3) m, of a predictor that follows the mouth of an episode.
+
+    It takes in every video frame, and forecasts at every control step from the frames seen.
+
+    Args:
+        predictor: of paths.
+        track: (T, K, 3) m, as of `MotionForecasters.forecast_track`.
+    """
+    follower, seen = predictor.follow(), frames_seen(track, predictor.recent)
+    made, frame = np.empty((len(track), MAX_LEAD, 3)), 0
+    for step, recent in enumerate(seen):
+        while STEPS_TO_MEET * frame <= FRAMES_TO_MEET * step:
+            meeting, later = divmod(frame, FRAMES_TO_MEET)
+            follower.update(track[STEPS_TO_MEET * meeting, later])
+            frame += 1
+        made[step] = follower.forecast(recent[::-1], MAX_LEAD)
+    return made
 
 
 def _step_times(count: int) -> NDArray[np.floating[Any]]:

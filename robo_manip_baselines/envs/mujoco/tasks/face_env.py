@@ -189,6 +189,7 @@ class FaceEnv(FaceScene, gymnasium.Env[Any, Any]):
         if spec.corruption.prediction != "truth":
             require_no_waiting(self.face_motion)
             self._forecasters = MotionForecasters.of(self.motion, self.library, self.people)
+            self._forecasters.require(spec.corruption.prediction)
         if spec.corruption.error == "model":
             if problem := prediction_problem(self.library.predicted_frames, spec.horizon):
                 raise RequestError(f"motion library '{self.library.source}' holds {problem}")
