@@ -67,7 +67,7 @@ def aggregate_results(
         plan: all of whose evaluations are done.
         store: of their outputs.
         out: folder to write to.
-        reference: condition that the others are compared with, see `analyze`.
+        reference: condition that the others are compared with; the plan's if None.
     """
     rows = [
         replace(result, condition=run.condition.name).to_line()
@@ -81,7 +81,7 @@ def aggregate_results(
     return analyze(
         read_result_rows([out / RESULTS], out),
         task=task_entry(plan.env),
-        reference=reference,
+        reference=reference or plan.references,
         conditions=conditions,
         headline=plan.headline,
     )

@@ -206,6 +206,32 @@ def _find_keys() -> dict[str, tuple[type, str]]:
 _KEYS = _find_keys()
 
 
+def find_references(conditions: Sequence[ConditionConfig], within: Sequence[str]) -> dict[str, str]:
+    """Return name of a condition -> name of the one that it is compared with.
+
+    That is the first that observes ``current`` of those that have the same values of all keys
+    ``within``, or the first of these.
+
+    Args:
+        conditions: in their order.
+        within: keys of entries of a file of conditions, such as ``motion`` and ``delay``.
+    """
+
+    def values(condition: ConditionConfig) -> tuple[Any, ...]:
+        spec = condition.spec
+        owners = {ConditionConfig: condition, ObservationSpec: spec, Corruption: spec.corruption}
+        return tuple(getattr(owners[owner], name) for owner, name in (_KEYS[key] for key in within))
+
+    alike: dict[tuple[Any, ...], list[ConditionConfig]] = {}
+    for condition in conditions:
+        alike.setdefault(values(condition), []).append(condition)
+    return {
+        condition.name: next((c for c in group if c.spec.obs == "current"), group[0]).name
+        for group in alike.values()
+        for condition in group
+    }
+
+
 @dataclass(frozen=True)
 class DrawnPeople:
     """People whose motion a benchmark draws, see `MotionLibrary.part`.
@@ -276,9 +302,10 @@ class ConditionsDocument:
         headline: end point of the benchmark, a key of `END_POINTS`.
         people: in demonstrations and evaluation.
         face: kind of face, one of `FACES`.
+        compare_within: keys of conditions, see `find_references`.
 
     Raises:
-        RequestError: there is no such end point or face.
+        RequestError: there is no such end point, face or key.
     """
 
     conditions: Annotated[tuple[Any, ...], Len(1, 1000)]
@@ -288,10 +315,13 @@ class ConditionsDocument:
     headline: str = "success"
     people: DrawnPeople = EVERYBODY
     face: str = FACES[0]
+    compare_within: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         require_choice("headline", self.headline, END_POINTS)
         require_choice("face", self.face, FACES)
+        for key in self.compare_within:
+            require_choice("key to compare within", key, _KEYS)
 
 
 @dataclass(frozen=True)
@@ -306,6 +336,7 @@ class ConditionFile:
         people: in demonstrations and evaluation.
         face: kind of face.
         sizes: name of a preset -> its numbers that this benchmark has otherwise.
+        compare_within: keys of conditions, see `find_references`.
     """
 
     env: str
@@ -315,6 +346,7 @@ class ConditionFile:
     people: DrawnPeople = EVERYBODY
     face: str = FACES[0]
     sizes: Mapping[str, SizeChanges] = field(default_factory=dict)
+    compare_within: tuple[str, ...] = ()
 
     def choose(self, names: Sequence[str]) -> tuple[ConditionConfig, ...]:
         """Return the conditions of these names, in the order of the file.
@@ -375,6 +407,7 @@ def read_conditions(path: Path) -> ConditionFile:
             document.people,
             document.face,
             document.sizes,
+            document.compare_within,
         )
         for names in file.presets.values():
             file.choose(names)

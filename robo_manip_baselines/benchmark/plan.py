@@ -13,6 +13,7 @@ from robo_manip_baselines.benchmark.conditions import (
     EVERYBODY,
     ConditionConfig,
     DrawnPeople,
+    find_references,
 )
 from robo_manip_baselines.benchmark.work_item import MOUNTS, OUT, WorkItem
 from robo_manip_baselines.benchmark.worker import LIBRARY, STATS
@@ -182,6 +183,7 @@ class Plan:
         headline: end point that was declared for it, see `ConditionFile`.
         people: in demonstrations and evaluation.
         face: kind of face, likewise.
+        compare_within: keys of conditions, likewise.
     """
 
     env: str
@@ -192,6 +194,13 @@ class Plan:
     headline: str = "success"
     people: DrawnPeople = EVERYBODY
     face: str = FACES[0]
+    compare_within: tuple[str, ...] = ()
+
+    @property
+    def references(self) -> dict[str, str] | None:
+        """Name of a condition -> name of its reference; None where the file declares none."""
+        within = self.compare_within
+        return find_references(self.conditions, within) if within else None
 
     @cached_property
     def runs(self) -> tuple[PlannedRun, ...]:
@@ -374,6 +383,7 @@ def make_plan(
     headline: str = "success",
     people: DrawnPeople = EVERYBODY,
     face: str = FACES[0],
+    compare_within: tuple[str, ...] = (),
 ) -> Plan:
     """Plan a benchmark.
 
@@ -386,6 +396,7 @@ def make_plan(
         headline: end point of the benchmark.
         people: in demonstrations and evaluation.
         face: kind of face, likewise.
+        compare_within: keys of conditions, see `find_references`.
 
     Raises:
         RequestError: a file cannot be used, a condition needs predictions that the library lacks or
@@ -418,6 +429,7 @@ def make_plan(
         headline,
         people,
         face,
+        compare_within,
     )
 
 

@@ -95,8 +95,8 @@ class BenchmarkOptions:
         motion_library: File of recorded face motion, or extended; the one that ships if not
             given.
         error_stats: File of error statistics; the one that ships with the package if not given.
-        reference: Condition that tables compare the others with; current if not given, or the first
-            one.
+        reference: Condition that tables compare the others with; if not given, current (in studies
+            of several motions or delays, that of the same), or the first one.
         executor: Place of the work: local (processes of this machine) or ray (a Ray cluster).
         address: Only with --executor ray: address of the cluster, or auto; if not given, one is
             started here.
@@ -292,6 +292,7 @@ def plan_of(options: BenchmarkOptions) -> Plan:
         headline=file.headline,
         people=file.people,
         face=options.face or file.face,
+        compare_within=file.compare_within,
     )
 
 

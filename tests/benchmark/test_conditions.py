@@ -11,6 +11,7 @@ from robo_manip_baselines.benchmark.conditions import (
     CONDITIONS,
     ConditionConfig,
     DrawnPeople,
+    find_references,
     read_conditions,
 )
 from robo_manip_baselines.benchmark.plan import PRESETS
@@ -78,6 +79,26 @@ def test_the_conditions_of_foresight_policies_are_a_grid_and_one_control() -> No
         like, name="dyskinetic_delay4_truth_absolute", spec=replace(like.spec, relative=False)
     )
     assert len(file.choose(file.presets["smoke"])) == 3
+
+
+def test_what_a_condition_is_compared_with() -> None:
+    file = read_conditions(CONDITIONS / "foresight_policies.yaml")
+    assert file.compare_within == ("motion", "delay")
+    found = find_references(file.conditions, file.compare_within)
+    assert len(found) == len(file.conditions)
+    for c in file.conditions:
+        assert found[c.name] == f"{c.motion}_delay{c.spec.corruption.delay}_current"
+    # Without `current`, the first one.
+    some = file.choose(["sway_delay4_truth", "sway_delay4_history", "sway_delay8_current"])
+    assert find_references(some, ("motion", "delay")) == {
+        "sway_delay4_history": "sway_delay4_history",
+        "sway_delay4_truth": "sway_delay4_history",
+        "sway_delay8_current": "sway_delay8_current",
+    }
+    # Keys of the condition, of the observation and of its corruption.
+    assert set(find_references(file.conditions, ("policy",)).values()) == {file.conditions[0].name}
+    by_horizon = find_references(file.conditions, ("horizon", "prediction"))
+    assert by_horizon["sway_delay8_truth"] == "dyskinetic_delay8_truth"
 
 
 def test_the_conditions_of_foresight_horizons_are_a_grid_of_true_futures() -> None:
@@ -243,6 +264,7 @@ def test_what_is_wrong_is_said_in_one_line_with_its_number(
         ("presets: [b]\nconditions: [{name: a}]", "presets: must be an object"),
         ("headline: strict\nconditions: [{name: a}]", "unknown headline 'strict'"),
         ("headline: 3\nconditions: [{name: a}]", "headline: must be text"),
+        ("compare_within: [speed]\nconditions: [{name: a}]", "key to compare within 'speed'"),
         ("people: test\nconditions: [{name: a}]", "people: must be an object"),
         (
             "people: {evaluation: tests}\nconditions: [{name: a}]",

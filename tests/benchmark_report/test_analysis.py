@@ -91,7 +91,7 @@ def test_environments_are_not_mixed(
 def test_counts_are_those_of_the_rows(
     statistics: BenchmarkStatistics, rows: tuple[ResultRow, ...]
 ) -> None:
-    assert statistics.reference == "current"
+    assert statistics.references == ("current",)
     assert statistics.seeds == tuple(range(1000, 1100))
     assert [c.condition.name for c in statistics.conditions][:4] == [
         "baseline",
@@ -207,17 +207,37 @@ def test_intervals_do_not_depend_on_other_conditions(
         )
 
 
+def test_each_condition_has_its_own_reference(make_rows: MakeRows) -> None:
+    """The numbers are those of a comparison with that reference alone, but for Holm's."""
+    now, late = ["current", "current_pred_h2"], ["current_delay3", "current_pred_h2_delay3"]
+    rows = make_rows(conditions=[*now, *late], train_seeds=2, episodes=20)
+    own = {"current": now, "current_delay3": late}
+    references = {name: reference for reference, names in own.items() for name in names}
+    both = analyze(rows, task=TASK, reference=references, resamples=50)
+    assert set(both.references) == set(own)
+    for reference, (_, name) in own.items():
+        alone = analyze(rows, task=TASK, reference=reference, resamples=50).of(name)
+        assert both.of(name).reference == reference
+        for kind in ("success_difference", "strict_difference", "time_difference"):
+            ours, theirs = (getattr(c, kind) for c in (both.of(name), alone))
+            assert replace(ours, p_holm=None) == replace(theirs, p_holm=None)
+            assert ours.difference.n
+        assert both.of(reference).is_reference
+        assert both.of(reference).success_difference == NO_COMPARISON
+
+
 def test_reference(make_rows: MakeRows) -> None:
     rows = make_rows(conditions=["baseline", "current_pred_h2"], train_seeds=1, episodes=5)
-    assert analyze(rows, task=TASK, resamples=50).reference == "baseline"
-    assert (
-        analyze(rows, task=TASK, reference="current_pred_h2", resamples=50).reference
-        == "current_pred_h2"
-    )
+    assert analyze(rows, task=TASK, resamples=50).references == ("baseline",)
+    given = analyze(rows, task=TASK, reference="current_pred_h2", resamples=50)
+    assert given.references == ("current_pred_h2",)
+    assert [c.is_reference for c in given.conditions] == [False, True]
     with pytest.raises(RequestError, match=r"unknown reference condition 'current_pred_h3'.*h2"):
         analyze(rows, task=TASK, reference="current_pred_h3")
     with pytest.raises(RequestError, match="there are no result rows"):
         analyze([], task=TASK)
+    with pytest.raises(RequestError, match="unknown reference condition 'gone'"):
+        analyze(rows, task=TASK, reference=dict.fromkeys(["baseline", "current_pred_h2"], "gone"))
     described = {"baseline": ConditionDescription("baseline", "Blind", FURTHER)}
     renamed = analyze(rows, task=TASK, conditions=described, resamples=50)
     assert renamed.conditions[1].condition.label == "Blind"

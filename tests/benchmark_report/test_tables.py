@@ -255,6 +255,27 @@ def test_the_declared_end_point_comes_first(
     assert row.cells[5].selection.is_strictly_different
 
 
+def test_tables_name_each_conditions_reference(
+    make_rows: Callable[..., tuple[ResultRow, ...]],
+) -> None:
+    names = ["current", "current_pred_h2", "current_delay3", "current_pred_h2_delay3"]
+    rows = make_rows(conditions=names, train_seeds=1, episodes=20)
+    references = {name: names[n - n % 2] for n, name in enumerate(names)}
+    statistics = analyze(rows, task=TASK, reference=references, resamples=50)
+    tables = {table.name: table for table in benchmark_tables(statistics)}
+    differences = tables["success_differences"]
+    assert differences.title == "Success against the reference"
+    assert [row.cells[0].values[0] for row in differences.rows] == names[1::2]
+    labels = [statistics.of(name).condition.label for name in names[::2]]
+    assert [row.cells[1].text for row in differences.rows] == labels
+    for row, reference in zip(differences.rows, names[::2], strict=True):
+        assert all(c.selection.versus == (reference,) for c in row.cells[2:] if c.selection)
+    times = {row.cells[0].values[0]: row for row in tables["completion_times"].rows}
+    against = [column.title for column in tables["completion_times"].columns].index("Against")
+    assert times["current_pred_h2_delay3"].cells[against].text == labels[1]
+    assert times["current_delay3"].cells[against].values == (None,)
+
+
 def test_safety_is_beside_success(rows: tuple[ResultRow, ...]) -> None:
     own = [row for row in rows if row.result.condition == "current"]
     statistics = analyze(own, task=TASK, resamples=50)

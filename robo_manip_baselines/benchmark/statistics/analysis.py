@@ -77,6 +77,7 @@ class ConditionStatistics:
         time: s, mean completion time of successes.
         time_by_seed: training seed -> mean, s; None without a success.
         published: result in the paper; None where it has no such condition.
+        reference: name of the condition that it is compared with; its own for the reference itself.
         success_difference, strict_difference, time_difference: from the reference, on common seeds;
             `NO_COMPARISON` for the reference itself.
         published_success, published_time: against the paper, likewise without such a condition.
@@ -93,12 +94,18 @@ class ConditionStatistics:
     success_by_seed: dict[int | None, Proportion]
     time: Estimate
     time_by_seed: dict[int | None, float | None]
+    reference: str
     published: PublishedResult | None = None
     success_difference: Comparison = NO_COMPARISON
     strict_difference: Comparison = NO_COMPARISON
     time_difference: Comparison = NO_COMPARISON
     published_success: Comparison = NO_COMPARISON
     published_time: Comparison = NO_COMPARISON
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether it is compared with nothing."""
+        return self.reference == self.condition.name
 
 
 @dataclass(frozen=True)
@@ -133,7 +140,6 @@ class BenchmarkStatistics:
         task: that the conditions were evaluated on.
         study: its published results, claims and figures.
         conditions: in the order of the paper's table, further ones last.
-        reference: name of the condition that the others are compared with.
         seeds: evaluation seeds that all conditions have, with every training seed.
         findings: on the claims whose conditions were all evaluated.
         headline: end point that was declared before anything was run, a key of `END_POINTS`.
@@ -142,7 +148,6 @@ class BenchmarkStatistics:
     task: TaskEntry
     study: TaskStudy
     conditions: tuple[ConditionStatistics, ...]
-    reference: str
     seeds: tuple[int, ...]
     findings: tuple[Finding, ...]
     headline: str = "success"
@@ -170,6 +175,11 @@ class BenchmarkStatistics:
         return {c.condition.name: c for c in self.conditions}[name]
 
     @property
+    def references(self) -> tuple[str, ...]:
+        """Names of the conditions that others are compared with; mostly one."""
+        return tuple(dict.fromkeys(c.reference for c in self.conditions))
+
+    @property
     def train_seeds(self) -> tuple[int | None, ...]:
         """Training seeds of any condition; None is a policy that was not trained."""
         return sorted_train_seeds(s for c in self.conditions for s in c.outcomes.train_seeds)
@@ -184,7 +194,7 @@ def analyze(
     rows: Sequence[ResultRow],
     *,
     task: TaskEntry,
-    reference: str | None = None,
+    reference: str | Mapping[str, str] | None = None,
     conditions: Mapping[str, ConditionDescription] | None = None,
     headline: str = "success",
     resamples: int = RESAMPLES,
@@ -197,8 +207,8 @@ def analyze(
     Args:
         rows: of all conditions, see `read_result_rows`.
         task: that they are of.
-        reference: condition that the others are compared with; None takes ``current``, or the
-            first one where that was not evaluated.
+        reference: condition that the others are compared with, or name of a condition -> name of
+            its own; None takes ``current``, or the first one where that was not evaluated.
         conditions: name -> description of conditions whose rows do not describe them; may hold
             others, too.
         headline: end point of tables and figures, ``success`` or ``success_strict``.
@@ -224,7 +234,11 @@ def analyze(
     )
     if reference is None:
         reference = next((c.name for c in described if c.group == CURRENT), described[0].name)
-    require_choice("reference condition", reference, grouped)
+    if isinstance(reference, str):
+        reference = dict.fromkeys(grouped, reference)
+    references = {name: reference[name] for name in grouped}
+    for name in references.values():
+        require_choice("reference condition", name, grouped)
     study = task.load_study()
     if (rows[0].result.settings or {}).get("env_kwargs", {}).get("face", "visual") != "visual":
         # No paper has a face that yields.
@@ -243,9 +257,9 @@ def analyze(
             return rate_estimate(grid, rng(name, measure), resamples)
 
         def difference(compare: Callable[..., Comparison], measure: str) -> Comparison:
-            if name == reference:
+            if name == references[name]:
                 return NO_COMPARISON
-            pair = [own, outcomes[reference]]
+            pair = [own, outcomes[references[name]]]
             draws = rng(name, f"{measure} difference")
             if compare is paired_success:
                 compare = partial(paired_success, people=people_on_common_seeds(pair))
@@ -270,6 +284,7 @@ def analyze(
                 train_seed: float(np.nanmean(row)) if np.isfinite(row).any() else None
                 for train_seed, row in zip(own.train_seeds, own.time, strict=True)
             },
+            reference=references[name],
             published=published,
             success_difference=difference(paired_success, "success"),
             strict_difference=difference(paired_success, "strict"),
@@ -285,9 +300,7 @@ def analyze(
     claims = [claim for claim in study.claims if set(claim.weights) <= set(outcomes)]
     findings = tuple(_finding(claim, study, outcomes, resamples) for claim in claims)
     seeds = set.intersection(*(own.complete_seeds for own in outcomes.values()))
-    return BenchmarkStatistics(
-        task, study, tuple(found), reference, tuple(sorted(seeds)), findings, headline
-    )
+    return BenchmarkStatistics(task, study, tuple(found), tuple(sorted(seeds)), findings, headline)
 
 
 def _generator(text: str) -> np.random.Generator:

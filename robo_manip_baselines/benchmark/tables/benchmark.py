@@ -130,6 +130,10 @@ def significant(value: float, _: Sequence[float]) -> bool:
     return value < SIGNIFICANCE
 
 
+RowsOf = dict[str, Any] | Callable[[ConditionStatistics], dict[str, Any]]
+"""Attributes of `RowSelection` beside the condition, the same for all or those of each."""
+
+
 @dataclass(frozen=True)
 class Statistic:
     """Column of a statistic of all conditions.
@@ -141,7 +145,8 @@ class Statistic:
         values: paths of attributes of `ConditionStatistics`, one for each name; or a function that
             returns the values. A cell whose first value is None is empty.
         rows: selects the result rows that the values are computed from, by the attributes of
-            `RowSelection` beside the condition; None if from none.
+            `RowSelection` beside the condition, or a function that returns these; None if from
+            none.
         strong: whether a value is set in bold, given all of the column; never if None.
         is_text: whether cells hold words, not numbers.
     """
@@ -150,7 +155,7 @@ class Statistic:
     names: str
     text: Callable[..., str]
     values: str | Callable[[ConditionStatistics], tuple[Any, ...]]
-    rows: dict[str, Any] | None
+    rows: RowsOf | None
     strong: Callable[[Any, Sequence[Any]], bool] | None = None
     is_text: bool = False
 
@@ -171,11 +176,17 @@ class Statistic:
             make_cell(
                 value,
                 self.text,
-                None if self.rows is None else RowSelection(c.condition.name, **self.rows),
+                self._rows_of(c),
                 lambda value: self.strong is not None and self.strong(value, found),
             )
             for c, value in zip(conditions, values, strict=True)
         ]
+
+    def _rows_of(self, c: ConditionStatistics) -> RowSelection | None:
+        if self.rows is None:
+            return None
+        rows = self.rows(c) if callable(self.rows) else self.rows
+        return RowSelection(c.condition.name, **rows)
 
 
 def make_cell(
@@ -199,7 +210,7 @@ def interval(
     title: str,
     text: Callable[[float], str],
     estimate: str,
-    rows: dict[str, Any],
+    rows: RowsOf,
     prefix: str = "",
 ) -> Statistic:
     """Make the column of a 95 % interval, given the path of an estimate."""
@@ -207,7 +218,7 @@ def interval(
     return Statistic(title, names, _ends(text), f"{estimate}.low {estimate}.high", rows)
 
 
-def p_values(test: str, comparison: str, rows: dict[str, Any]) -> list[Statistic]:
+def p_values(test: str, comparison: str, rows: RowsOf) -> list[Statistic]:
     """Make the columns of a test's p-values, given the path of a comparison."""
     return [
         Statistic(f"{test} p", "p", p_text, f"{comparison}.p", rows),
@@ -457,8 +468,14 @@ def success_differences(statistics: BenchmarkStatistics, measure: str = "success
         statistics: of the benchmark.
         measure: ``success`` or ``strict``.
     """
-    is_strict, both = measure == "strict", {"versus": (statistics.reference,)}
-    differing = {**both, "is_strictly_different" if is_strict else "is_different": True}
+    is_strict = measure == "strict"
+
+    def both(c: ConditionStatistics) -> dict[str, Any]:
+        return {"versus": (c.reference,)}
+
+    def differing(c: ConditionStatistics) -> dict[str, Any]:
+        return {**both(c), "is_strictly_different" if is_strict else "is_different": True}
+
     comparison = f"{measure}_difference"
     difference = f"{comparison}.difference"
     counts = f"{comparison}.wins {comparison}.losses"
@@ -470,6 +487,7 @@ def success_differences(statistics: BenchmarkStatistics, measure: str = "success
         return f"{_ends(points)(low, high)} ({number} people)"
 
     columns = [
+        *reference_column(statistics),
         Statistic("Pairs", "pairs", str, f"{difference}.n", both),
         Statistic("Difference", "difference", points, f"{difference}.mean", both),
         interval("95 % interval", points, difference, both),
@@ -502,9 +520,25 @@ def success_differences(statistics: BenchmarkStatistics, measure: str = "success
         ),
     )
     what = "Strict success" if is_strict else "Success"
-    title = f"{what} against “{statistics.of(statistics.reference).condition.label}”"
-    others = [c for c in statistics.conditions if c.condition.name != statistics.reference]
+    title = f"{what} against {reference_text(statistics)}"
+    others = [c for c in statistics.conditions if not c.is_reference]
     return condition_table(f"{measure}_differences", title, others, columns, notes)
+
+
+def reference_text(statistics: BenchmarkStatistics) -> str:
+    """Return the label of what conditions are compared with, in quotes where it is one."""
+    name, *others = statistics.references
+    return "the reference" if others else f"“{statistics.of(name).condition.label}”"
+
+
+def reference_column(statistics: BenchmarkStatistics) -> tuple[Statistic, ...]:
+    """Return the column of what each condition is compared with; none where it is one for all."""
+
+    def label(c: ConditionStatistics) -> tuple[str | None]:
+        return (None if c.is_reference else statistics.of(c.reference).condition.label,)
+
+    column = Statistic("Against", "reference", str, label, None, is_text=True)
+    return (column,) if len(statistics.references) > 1 else ()
 
 
 def success_beside_paper(statistics: BenchmarkStatistics) -> Table:
@@ -548,12 +582,14 @@ def success_beside_paper(statistics: BenchmarkStatistics) -> Table:
 
 def times_table(statistics: BenchmarkStatistics) -> Table:
     """Make the table of completion times, and against the reference's on common seeds."""
-    reference, many = statistics.reference, statistics.has_many_train_seeds
-    both = {**SUCCESSES, "versus": (reference,)}
+    many = statistics.has_many_train_seeds
     comparison, difference = "time_difference", "time_difference.difference"
 
+    def both(c: ConditionStatistics) -> dict[str, Any]:
+        return {**SUCCESSES, "versus": (c.reference,)}
+
     def pairs(c: ConditionStatistics) -> tuple[int | None]:
-        return (None if c.condition.name == reference else c.time_difference.difference.n,)
+        return (None if c.is_reference else c.time_difference.difference.n,)
 
     def by_seed(c: ConditionStatistics) -> tuple[str]:
         return (";".join("" if time is None else repr(time) for time in c.time_by_seed.values()),)
@@ -566,6 +602,7 @@ def times_table(statistics: BenchmarkStatistics) -> Table:
         Statistic("Time, s", "time", seconds, "time.mean", SUCCESSES, lowest),
         interval("95 % interval", seconds, "time", SUCCESSES),
         Statistic("By training seed", "by_training_seed", seconds_by_seed, by_seed, SUCCESSES),
+        *reference_column(statistics),
         Statistic("Pairs", "pairs", str, pairs, both),
         Statistic("Difference, s", "difference", later, f"{difference}.mean", both),
         interval("Its 95 % interval", later, difference, both, "difference_"),
@@ -576,8 +613,8 @@ def times_table(statistics: BenchmarkStatistics) -> Table:
     notes = (
         f"Time: mean {statistics.task.completion_time}, over successes only, with a bootstrap "
         f"interval{' over training and evaluation seeds' if many else ''}.",
-        f"Difference: minus “{statistics.of(reference).condition.label}”, over episodes in which "
-        "both succeeded, so that a condition does not look fast for failing where it is slow; "
+        f"Difference: minus {reference_text(statistics)}, over episodes in which both succeeded, "
+        "so that a condition does not look fast for failing where it is slow; "
         "Wilcoxon's signed-rank test, Holm-corrected over the rows, bold below "
         f"{SIGNIFICANCE:.2f}.",
     )
