@@ -261,6 +261,12 @@ def plan_of(options: BenchmarkOptions) -> Plan:
     """
     path = options.conditions_file or CONDITIONS / f"{options.benchmark}.yaml"
     file = read_conditions(path)
+    if options.benchmark in [condition.name for condition in file.conditions]:
+        # The last of several --conditions, where no name came before them.
+        raise RequestError(
+            f"benchmark '{options.benchmark}': is a condition; the benchmark's name comes first: "
+            "python bin/Benchmark.py NAME --conditions ..."
+        )
     for preset in (*file.presets, *file.sizes):
         require_choice(f"preset in '{path}'", preset, PRESETS)
     changes = file.sizes.get(options.preset, AS_IN_THE_PRESET)

@@ -127,6 +127,8 @@ def test_conditions_are_chosen_by_name_and_from_a_file(tmp_path: Path) -> None:
     mine.write_text("conditions: [{name: a}, {name: b, delay: 3}]")
     assert names(f"mine --preset smoke --conditions_file {mine}") == ["a", "b"]
     assert names(f"mine --preset smoke --conditions_file {mine} --conditions b") == ["b"]
+    with pytest.raises(RequestError, match="'b': is a condition; the benchmark's name comes first"):
+        names(f"--conditions_file {mine} --conditions a b")
 
 
 def test_a_condition_that_cannot_be_had_is_left_out_unless_it_is_named(
