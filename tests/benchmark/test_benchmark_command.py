@@ -175,7 +175,7 @@ def test_the_precision_of_images_is_decided_once_for_all_nodes(
 def test_a_file_may_have_other_numbers_than_the_preset(tmp_path: Path) -> None:
     size = plan_of(options("foresight_policies")).preset
     assert (size.demonstrations, size.train_seeds, size.num_episodes) == (400, 3, 100)
-    assert size.train_settings == {"steps": 1000, "object_noise": 0.05}
+    assert size.train_settings == {"steps": 4000, "object_noise": 0.05}
     given = "foresight_policies --train_seeds 2 --train_settings steps=2000"
     size = plan_of(options(given)).preset
     assert (size.demonstrations, size.train_seeds) == (400, 2)
