@@ -18,6 +18,7 @@ from robo_manip_baselines.envs.mujoco.face.forecasters import (
     KALMAN_MEMORY,
     MAX_LEAD,
     LinearForecaster,
+    MotionForecasters,
     autoregression,
     constant_velocity,
     fit_autoregression,
@@ -194,10 +195,33 @@ def test_residual_is_the_predictors_output(
     np.testing.assert_allclose(made(seen, horizon * FRAME_PERIOD), expected, atol=1e-9)
 
 
-def test_a_motion_without_predictions_has_no_residual(dyskinetic: FeedingEnv) -> None:
-    assert residual_horizon(dyskinetic) == 0
-    with pytest.raises(RequestError, match=r"motion 'dyskinetic' .* has no predictions"):
-        Forecasters(dyskinetic).start("residual", 0)
+def test_recordings_without_predictions_have_no_residual(
+    recorded: FeedingEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded, "library", replace(recorded.library, predicted=None))
+    assert residual_horizon(recorded) == 0
+    with pytest.raises(RequestError, match=r"motion 'recorded' .* has no predictions"):
+        Forecasters(recorded).start("residual", 0)
+
+
+def test_residual_of_a_computed_motion_follows_the_mouth(dyskinetic: FeedingEnv) -> None:
+    dyskinetic.reset(seed=2)
+    assert residual_horizon(dyskinetic) == 24
+    made = Forecasters(dyskinetic).start("residual", 2)
+    fitted = MotionForecasters.of(dyskinetic.motion, dyskinetic.library, dyskinetic.people)
+    track = fitted.forecast_track("residual", dyskinetic.replay.mouth, 2)
+    for step in (0, 100, 153):
+        seen = step * 0.02
+        np.testing.assert_allclose(made(seen, 0.0), dyskinetic.mouth_at(seen), atol=1e-9)
+        for ahead in (1, 8, 24):
+            wanted = track[step, ahead - 1]
+            np.testing.assert_allclose(made(seen, ahead * FRAME_PERIOD), wanted, atol=1e-9)
+        # Later, and before the next control step, it is the same forecast.
+        later = (track[step, 3] + 2 * track[step, 4]) / 3
+        moment = seen + 0.01
+        np.testing.assert_allclose(
+            made(moment, (4 + 2 / 3) * FRAME_PERIOD - 0.01), later, atol=1e-9
+        )
 
 
 def test_weights_are_interpolated_between_horizons() -> None:

@@ -106,5 +106,6 @@ def test_unknown_presets_are_refused() -> None:
 
 def test_a_predictor_is_not_asked_beyond_its_horizon() -> None:
     near = Cell("recorded", 0, "direct", "residual", 3)
-    cells = [near, near._replace(lead=25), near._replace(motion="sway"), CELLS[0]]
-    assert possible_cells(cells) == (near, CELLS[0])
+    other = near._replace(motion="sway")
+    cells = [near, near._replace(lead=25), other, other._replace(lead=25), CELLS[0]]
+    assert possible_cells(cells) == (near, other, CELLS[0])

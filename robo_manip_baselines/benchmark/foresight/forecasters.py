@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from robo_manip_baselines.envs.mujoco.cell.scene import CONTROL_PERIOD
 from robo_manip_baselines.envs.mujoco.expert.servo import Forecast
 from robo_manip_baselines.envs.mujoco.face.forecasters import MotionForecasters
 from robo_manip_baselines.envs.mujoco.tasks.face_env import FaceEnv
-from robo_manip_baselines.observation import FRAME_PERIOD
+from robo_manip_baselines.observation import FRAME_PERIOD, MAX_HORIZON
 from robo_manip_baselines.runs.errors import RequestError
 
 Floats = NDArray[np.float64]
@@ -47,7 +48,7 @@ class Forecasters:
         if name == "shuffled":
             return self._shuffled(seed)
         if name == "residual":
-            return self._residual()
+            return self._residual() if world.motion.is_as_recorded else self._followed(seed)
         forecaster = self._made.linear(name)
         return lambda seen, ahead: forecaster(world.mouth_at, seen, ahead)
 
@@ -60,6 +61,19 @@ class Forecasters:
             return world.mouth_at(seen) + then - now
 
         return shuffled
+
+    def _followed(self, seed: int) -> Forecast:
+        """Return a predictor's that follows the mouth, made at the last control step until then."""
+        track = self._world.replay.mouth
+        made = self._made.forecast_track("residual", track, seed)
+
+        def followed(seen: float, ahead: float) -> Floats:
+            step = min(int(max(seen, 0.0) / CONTROL_PERIOD + 1e-6), len(track) - 1)
+            known = np.concatenate([track[step, :1], made[step]])
+            frames = (seen + ahead - step * CONTROL_PERIOD) / FRAME_PERIOD
+            return np.array([np.interp(frames, np.arange(len(known)), axis) for axis in known.T])
+
+        return followed
 
     def _residual(self) -> Forecast:
         """Return a trained predictor's forecast, its error held from frame to frame.
@@ -85,6 +99,11 @@ class Forecasters:
 
 
 def residual_horizon(world: FaceEnv) -> int:
-    """Return how many frames a trained predictor looks ahead in an environment; 0 without one."""
+    """Return how many frames a trained predictor looks ahead in an environment; 0 without one.
+
+    Of recorded motion it is the library's, of any other one it is fitted to the motion.
+    """
+    if not world.motion.is_as_recorded:
+        return MAX_HORIZON
     predicted = world.library.predicted
-    return predicted.shape[1] if predicted is not None and world.motion.is_as_recorded else 0
+    return 0 if predicted is None else predicted.shape[1]
