@@ -21,9 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from face_prediction.models.residual.experts import (
-    EXPERTS,
     RECENT,
-    SERIES,
     SLOW,
     Floats,
     LinearExpert,
@@ -86,12 +84,14 @@ class LinearFit:
     """Training people's part of a linear expert.
 
     Attributes:
+        expert: whose part it is.
         scale: (F,) standard deviation of the features.
         people: (H, F, D) coefficients of scaled features.
         precision: (2, F, F) inverse covariance of a person's coefficients about these, for each of
             `BANDS`; None for the iterated expert, which does not adapt.
     """
 
+    expert: LinearExpert
     scale: Floats
     people: Floats
     precision: Floats | None
@@ -103,7 +103,7 @@ class PeopleFit:
 
     Attributes:
         horizons: (H,) frames ahead.
-        linear: fits of `EXPERTS`, in their order.
+        linear: fits of all experts.
         usual: (E + 1, H, 2) constant and slope of the logarithm of an expert's mean error over the
             pace of a face, by the logarithm of that pace over ``pace``; the last is the mixture.
         pace: median mean step of the mouth, in face sides.
@@ -158,12 +158,12 @@ class Mixture:
         self.fit, self.frames = fit, 0
         knots, top = len(fit.horizons), int(fit.horizons[-1])
         self._steps = np.zeros(faces)
-        self._errors = np.zeros((faces, len(EXPERTS), knots))
+        self._errors = np.zeros((faces, len(fit.linear), knots))
         self._mixed_errors = np.zeros((faces, knots))
         self._late_errors = np.zeros((faces, knots))
         self._count, self._late_count = np.zeros(knots), np.zeros(knots)
         self._moved = Ring(top, (faces, knots, 2))
-        self._experts = Ring(top, (faces, len(EXPERTS), knots, 2))
+        self._experts = Ring(top, (faces, len(fit.linear), knots, 2))
 
     def keep(self, faces: int) -> None:
         """Go on with the first so many faces."""
@@ -256,7 +256,7 @@ class Mixture:
     def _caution(self, speed: Floats) -> Floats:
         """Factors (N, E, 1) on the errors of the experts at a speed (N,) of the mouth."""
         calm = np.clip(np.log(CALM / speed), 0, MOST_CALM) * min(1.0, PROVEN / self.frames)
-        caution = np.where([expert.iterated for expert in EXPERTS], 0.0, CAUTION)
+        caution = np.where([part.expert.iterated for part in self.fit.linear], 0.0, CAUTION)
         return np.exp(calm[:, None] * caution)[..., None]
 
 
@@ -271,13 +271,11 @@ class FaceState:
     def __init__(self, fit: PeopleFit, faces: int) -> None:
         self.fit, self.mixture = fit, Mixture(fit, faces)
         top = int(fit.horizons[-1])
-        self._recent = np.zeros((faces, max(RECENT, top + 1), SERIES))
-        self._slow = np.zeros((faces, len(SLOW), SERIES))
+        series = fit.linear[0].people.shape[-1]
+        self._recent = np.zeros((faces, max(RECENT, top + 1), series))
+        self._slow = np.zeros((faces, len(SLOW), series))
         bands = [band for band in BANDS if band.knots.start < len(fit.horizons)]
-        self._learners = [
-            _Learner(expert, part, faces, bands, fit.horizons)
-            for expert, part in zip(EXPERTS, fit.linear, strict=True)
-        ]
+        self._learners = [_Learner(part, faces, bands, fit.horizons) for part in fit.linear]
 
     def keep(self, faces: int) -> None:
         """Go on with the first so many faces."""
@@ -370,14 +368,14 @@ class _Learner:
 
     def __init__(
         self,
-        expert: LinearExpert,
         fit: LinearFit,
         faces: int,
         bands: Sequence[Band],
         horizons: NDArray[np.int64],
     ) -> None:
-        self.expert, self.fit, self._bands, self._horizons = expert, fit, bands, horizons
-        size, top = expert.size, int(horizons[-1])
+        self.fit, self._bands, self._horizons = fit, bands, horizons
+        size, top = fit.expert.size, int(horizons[-1])
+        self._series = fit.people.shape[-1]
         self._people = fit.people.swapaxes(0, 1).reshape(size, -1)
         self._past, self._made = (
             Ring(top, (faces, size)),
@@ -387,7 +385,7 @@ class _Learner:
         if fit.precision is None:
             return
         self._gram = np.zeros((len(bands), faces, size, size))
-        self._cross = np.zeros((len(horizons), faces, size, SERIES))
+        self._cross = np.zeros((len(horizons), faces, size, self._series))
         self._inverse: list[Ring] = []
         for band, precision in zip(bands, fit.precision, strict=False):
             # as they were when the first horizon of the band knew no more
@@ -408,7 +406,7 @@ class _Learner:
 
     def features(self, recent: Floats, slow: Floats) -> Floats:
         """Scaled features (N, F) of recent frames (N, W, D)."""
-        return linear_features(self.expert, recent, slow) / self.fit.scale
+        return linear_features(self.fit.expert, recent, slow) / self.fit.scale
 
     def remember(self, features: Floats) -> None:
         """Keep the features (N, F) of a forecast, to learn from its outcome."""
@@ -417,7 +415,8 @@ class _Learner:
 
     def forecast(self, features: Floats) -> Floats:
         """Displacements (N, H, D) from scaled features (N, F)."""
-        result = (features @ self._people).reshape(len(features), len(self._horizons), SERIES)
+        size = len(features), len(self._horizons), self._series
+        result = (features @ self._people).reshape(size)
         if self.fit.precision is None:
             return result
         for band, inverse in zip(self._bands, self._inverse, strict=True):
@@ -457,7 +456,8 @@ class _Learner:
             self._inverse[number].push(np.linalg.inv(gram + self.fit.precision[number]))
             for place in range(first, stop):
                 age = int(ages[place])
-                people = self._made.row(age)[:, place * SERIES : (place + 1) * SERIES]
+                own = slice(place * self._series, (place + 1) * self._series)
+                people = self._made.row(age)[:, own]
                 missed = truth[:, place] - people
                 weight = self._weights[number].row(age - int(ages[first]) + 1)
                 cross = self._cross[place]

@@ -109,14 +109,18 @@ class Rows:
         return np.flatnonzero(is_fitted & (self.left >= horizon))
 
 
-def fit_people(tracks: Sequence[Floats], subjects: Sequence[str]) -> PeopleFit:
-    """Fit every expert to tracks (T, D) of people.
+def fit_people(
+    tracks: Sequence[Floats],
+    subjects: Sequence[str],
+    experts: Sequence[LinearExpert] = EXPERTS,
+) -> PeopleFit:
+    """Fit experts to tracks (T, D) of people.
 
     All errors count as alike: `fit_residual` measures them.
     """
     rows, knots = Rows.of(tracks, subjects), np.array(HORIZONS)
-    linear = tuple(fit_linear(expert, rows, knots) for expert in EXPERTS)
-    growth = np.log(np.tile(knots.astype(np.float64), (len(EXPERTS) + 1, 1)))
+    linear = tuple(fit_linear(expert, rows, knots) for expert in experts)
+    growth = np.log(np.tile(knots.astype(np.float64), (len(experts) + 1, 1)))
     usual = np.stack([growth, np.zeros_like(growth)], axis=-1)
     return PeopleFit(knots, linear, usual, float(np.median(rows.pace[rows.seen == 0])))
 
@@ -131,7 +135,7 @@ def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) ->
     usual = [band.usual for band in BANDS]
     precision = np.empty((len(BANDS), size, size))
     if expert.iterated:
-        return LinearFit(scale, iterated(expert, features, scale, rows, horizons), None)
+        return LinearFit(expert, scale, iterated(expert, features, scale, rows, horizons), None)
     for place, horizon in enumerate(horizons.tolist()):
         origins = rows.origins(horizon)
         x = features[origins]
@@ -140,7 +144,7 @@ def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) ->
         if place in usual:
             rest = (y - x @ people[place])[:, :2]
             precision[usual.index(place)] = spread(x, rest, rows.person[origins], horizon)
-    return LinearFit(scale, people, precision)
+    return LinearFit(expert, scale, people, precision)
 
 
 def iterated(
@@ -271,7 +275,7 @@ def trial(fit: ResidualFit, tracks: Sequence[Floats]) -> list[tuple[Floats, Floa
     Returns:
         Forecasts of the mouth of each track by the experts (T, E, H, 2) and the mixture (T, H, 2).
     """
-    shape = (len(EXPERTS), len(fit.people.horizons), 2)
+    shape = (len(fit.people.linear), len(fit.people.horizons), 2)
     made: list[tuple[Floats, Floats]] = [
         (np.empty((len(t), *shape)), np.empty((len(t), *shape[1:]))) for t in tracks
     ]
@@ -320,7 +324,7 @@ def usual_errors(
     ratio = np.log(np.clip(np.array(paces) / pace, 1 / MOST_PACE, MOST_PACE))
     rows = np.stack([np.ones_like(ratio), ratio], axis=1)
     solution = np.linalg.lstsq(rows, np.array(relative).reshape(len(ratio), -1), rcond=None)[0]
-    return solution.T.reshape(len(EXPERTS) + 1, len(HORIZONS), 2)
+    return solution.T.reshape(-1, len(HORIZONS), 2)
 
 
 def mix_again(

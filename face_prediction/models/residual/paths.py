@@ -16,12 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.models.residual.adaptive import FaceState, PeopleFit
-from face_prediction.models.residual.experts import RECENT, SERIES, SHAPES, Floats
+from face_prediction.models.residual.experts import EXPERTS as FACE_EXPERTS
+from face_prediction.models.residual.experts import RECENT, SHAPES, Floats
 from face_prediction.models.residual.fit import fit_people, trial, usual_errors
 from face_prediction.models.residual.intervals import IntervalFit
 from face_prediction.models.residual.predictor import ResidualFit, every_frame, require_horizon
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
+
+EXPERTS = tuple(replace(expert, shapes=min(expert.shapes, 2)) for expert in FACE_EXPERTS)
+"""A face that moves as one piece has two principal shapes, its translations across the view."""
 
 FACE_SIDE = 0.21
 """m, side of a crop around a face: the median of the shipped motion library."""
@@ -94,7 +98,7 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
         [series for path in part for series in path_series(path)]
         for part in (paths[:count], paths[count:])
     )
-    people = fit_people(fitted, [str(number // 2) for number in range(len(fitted))])
+    people = fit_people(fitted, [str(number // 2) for number in range(len(fitted))], EXPERTS)
     people = replace(
         people,
         linear=tuple(
@@ -114,14 +118,14 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
 
 
 def path_series(path: NDArray[np.floating]) -> Floats:
-    """Series (2, T, D) in face sides of a path (T, 3) m: across the view, and of the depth.
+    """Series (2, T, 4) in face sides of a path (T, 3) m: across the view, and of the depth.
 
-    The first two principal shapes of a face that moves as one piece are its translations.
+    The mouth, and the shapes, which move as it does.
     """
-    series = np.zeros((2, len(path), SERIES))
+    series = np.zeros((2, len(path), 4))
     series[0, :, :2] = path[:, 1:]
     series[1, :, 0] = path[:, 0]
-    series[..., 2:4] = series[..., :2]
+    series[..., 2:] = series[..., :2]
     return series / FACE_SIDE
 
 

@@ -106,11 +106,12 @@ class ResidualFit:
             )
         linear = tuple(
             LinearFit(
+                expert,
                 arrays[f"scale_{index}"],
                 arrays[f"people_{index}"],
                 arrays.get(f"precision_{index}"),
             )
-            for index in range(len(EXPERTS))
+            for index, expert in enumerate(EXPERTS)
         )
         people = PeopleFit(
             arrays["horizons"].astype(np.int64),
