@@ -1,1 +1,1 @@
-"""Residual prediction: an adaptive prior, corrected by a network."""
+"""Residual prediction: linear experts that keep learning from the face that they follow."""
