@@ -62,6 +62,7 @@ FITTED = ("constant_velocity", "autoregression", "kalman", "shuffled", "residual
 """Forecasters other than the truth."""
 
 SOME = ("constant_velocity", "autoregression", "residual")
+"""Those that are tried at a further delay, or under a further motion."""
 
 
 def _cpu() -> tuple[Cell, ...]:
