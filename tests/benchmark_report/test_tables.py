@@ -14,8 +14,8 @@ import pytest
 from robo_manip_baselines.benchmark.aggregation import closing_summary
 from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
 from robo_manip_baselines.benchmark.statistics.outcomes import ResultRow
-from robo_manip_baselines.benchmark.tables.benchmark import (
-    benchmark_tables,
+from robo_manip_baselines.benchmark.tables.benchmark import benchmark_tables
+from robo_manip_baselines.benchmark.tables.columns import (
     later,
     p_text,
     p_values,
