@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 
 from robo_manip_baselines.benchmark.conditions import ConditionConfig
-from robo_manip_baselines.benchmark.report.figures import INK, benchmark_figures
+from robo_manip_baselines.benchmark.report.figures import INK, benchmark_figures, in_two_lines
 from robo_manip_baselines.benchmark.report.page import make_report, render_report
 from robo_manip_baselines.benchmark.statistics.analysis import BenchmarkStatistics, analyze
 from robo_manip_baselines.benchmark.statistics.conditions import describe_condition
@@ -73,3 +73,16 @@ def test_titles_that_are_no_line_are_refused(title: str) -> None:
     with pytest.raises(RequestError, match=r"^title ") as caught:
         ConditionConfig("a", title=title)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("label", "lines"),
+    [
+        ("Mouth, late", ["Mouth, late"]),
+        ("Current + prediction, 2 frames", ["Current + prediction", "2 frames"]),
+        ("Mouth, late, and its true future", ["Mouth, late", "and its true future"]),
+        ("dyskinetic_delay4_current", ["dyskinetic_delay4_current"]),
+    ],
+)
+def test_long_labels_are_broken_near_their_middle(label: str, lines: list[str]) -> None:
+    assert in_two_lines(label).split("\n") == lines

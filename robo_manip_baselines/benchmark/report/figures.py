@@ -331,7 +331,7 @@ def draw_episodes(episode_figure: EpisodeFigure) -> Draw:
             results = [row.result for row in c.rows]
             values = [{**r.columns, "is_success": r.is_success} for r in results]
             episode_figure.draw(axes, values, many)
-            axes.set_title(_in_two_lines(c.condition.label), fontsize=9)
+            axes.set_title(in_two_lines(c.condition.label), fontsize=9)
         figure.supxlabel(episode_figure.xlabel, fontsize=10)
         figure.supylabel(episode_figure.ylabel, fontsize=10)
         return episode_figure.caption, episode_figure.summary
@@ -410,7 +410,7 @@ def draw_faces(figure: Any, panels: Mapping[str, Sequence[EpisodeSafety]]) -> No
         largest = max((own.force for own in episodes), default=0.0)
         text = f"{touched} of {len(episodes)} episodes\nlargest {largest:.1f} N"
         axes.text(0.02, 0.01, text, transform=axes.transAxes, fontsize=7, va="bottom")
-        axes.set_title(_in_two_lines(label), fontsize=9)
+        axes.set_title(in_two_lines(label), fontsize=9)
         axes.set(xlim=(-100.0, 100.0), ylim=(-135.0, 95.0), aspect="equal")
     figure.supxlabel("across the face, mm (right: the person's left)", fontsize=10)
     figure.supylabel("up, mm", fontsize=10)
@@ -541,6 +541,7 @@ def draw_net_lead(
     for axes, (title, shown) in zip(grid.flat, panels.items(), strict=False):
         axes.set_title(title)
         axes.axvline(0.0, color=GREY, lw=1.0, ls=":")
+        axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(axis="y")
         for own in shown:
             number = delays.index(own.delay)
@@ -588,7 +589,10 @@ def _label_rows(axes: Any, conditions: Sequence[ConditionStatistics]) -> None:
     axes.tick_params(axis="y", length=0)
 
 
-def _in_two_lines(label: str) -> str:
-    """Break a long label at its first comma."""
-    head, comma, tail = label.partition(", ")
-    return f"{head}\n{tail}" if comma and len(label) > 18 else label
+def in_two_lines(label: str) -> str:
+    """Break a long label at the comma nearest to its middle."""
+    commas = [match.start() for match in re.finditer(", ", label)]
+    if not commas or len(label) <= 18:
+        return label
+    middle = min(commas, key=lambda comma: abs(2 * comma - len(label)))
+    return f"{label[:middle]}\n{label[middle + 2 :]}"
