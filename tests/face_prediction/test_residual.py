@@ -24,8 +24,17 @@ from face_prediction.models.residual.adaptive import (
     Mixture,
     Ring,
 )
-from face_prediction.models.residual.experts import EXPERTS, SERIES, SLOW, LinearExpert, slow_means
+from face_prediction.models.residual.experts import (
+    EXPERTS,
+    SERIES,
+    SLOW,
+    LinearExpert,
+    frames_needed,
+    linear_features,
+    slow_means,
+)
 from face_prediction.models.residual.fit import (
+    RIDGE,
     Rows,
     fit_linear,
     fit_people,
@@ -306,11 +315,11 @@ def test_the_iterated_expert_forecasts_frame_by_frame() -> None:
     steps = rng.normal(0, 0.01, (400, SERIES))
     for frame in range(1, 400):
         steps[frame] += 0.6 * steps[frame - 1]
-    rows = Rows.of([np.cumsum(steps, axis=0)] * 2, ["ann", "bob"])
     expert = LinearExpert(4, 2, 0, iterated=True)
-    fit = fit_linear(expert, rows, np.array(HORIZONS))
+    rows = Rows.of([np.cumsum(steps, axis=0)] * 2, ["ann", "bob"], frames_needed([expert]))
+    fit = fit_linear(expert, rows, np.array(HORIZONS), RIDGE)
     assert fit.precision is None
-    once = fit_linear(expert, rows, np.array([1])).people[0] / fit.scale[:, None]  # (F, D)
+    once = fit_linear(expert, rows, np.array([1]), RIDGE).people[0] / fit.scale[:, None]  # (F, D)
     past = steps[-2:, 2:6].copy()
     moved = []
     for _ in range(HORIZONS[-1]):
@@ -320,6 +329,15 @@ def test_the_iterated_expert_forecasts_frame_by_frame() -> None:
     expected = np.cumsum(moved, axis=0)[np.array(HORIZONS) - 1]
     found = steps[-2:, 2:6].reshape(-1) / fit.scale @ fit.people
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_differences_of_a_cube_end_at_the_third() -> None:
+    expert = LinearExpert(0, 5, 1, differences=True)
+    frames = np.arange(frames_needed([expert]), dtype=np.float64)
+    recent = np.stack([frames**3, -2 * frames], axis=1)[None]
+    found = linear_features(expert, recent, np.zeros((1, 1, 2)))[0].reshape(6, 2)
+    np.testing.assert_array_equal(found[:, 0], [61, 24, 6, 0, 0, 125])
+    np.testing.assert_array_equal(found[:, 1], [-2, 0, 0, 0, 0, -10])
 
 
 def test_slow_means_begin_as_the_mean() -> None:

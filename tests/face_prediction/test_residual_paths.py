@@ -7,7 +7,6 @@ import pytest
 
 from face_prediction.models.residual.adaptive import FaceState
 from face_prediction.models.residual.paths import FACE_SIDE, PathPredictor, fit_paths, path_series
-from face_prediction.models.residual.predictor import every_frame
 from robo_manip_baselines.runs.errors import RequestError
 
 
@@ -55,8 +54,9 @@ def test_a_mouth_across_is_a_face_of_that_side(predictor: PathPredictor) -> None
         state.take(series[None])
         made = state.forecast()
         state.remember(made)
-    moved = FACE_SIDE * every_frame(made.moved, predictor.people.horizons, 24)[0, :, :2]
-    np.testing.assert_allclose(forecasts(predictor, path)[-1, :, 1:], path[-1, 1:] + moved)
+    moved = FACE_SIDE * made.moved[0, :, :2]
+    at_knots = forecasts(predictor, path)[-1, predictor.people.horizons - 1, 1:]
+    np.testing.assert_allclose(at_knots, path[-1, 1:] + moved)
 
 
 def test_another_place_is_no_other_motion(predictor: PathPredictor) -> None:
@@ -86,6 +86,18 @@ def test_a_face_is_learnt(predictor: PathPredictor) -> None:
         rest[number] = np.linalg.norm(path[:-8] - path[8:], axis=1)
     assert error[:, 100:].mean() < 0.5 * error[:, 5:50].mean()
     assert error[:, 100:].mean() < 0.1 * rest.mean()
+
+
+def test_a_mouth_in_motion_is_no_mouth_that_starts(predictor: PathPredictor) -> None:
+    """It stays until it has a past, and is forecast well, between knots too, once it has one."""
+    path = swaying(1, 60, seed=6)[0]
+    made, first = forecasts(predictor, path), predictor.recent - 1
+    np.testing.assert_array_equal(made[:first], path[:first, None].repeat(24, 1))
+    for ahead in (5, 8, 10, 12):
+        origins = np.arange(first, 60 - ahead)
+        error = np.linalg.norm(made[origins, ahead - 1] - path[origins + ahead], axis=1)
+        rest = np.linalg.norm(path[origins] - path[origins + ahead], axis=1)
+        assert error.mean() < 0.08 * rest.mean()
 
 
 def test_too_few_people_or_too_far_ahead_are_refused(predictor: PathPredictor) -> None:

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from face_prediction.models.residual.experts import (
-    RECENT,
     SLOW,
     Floats,
     LinearExpert,
+    frames_needed,
     linear_features,
     slow_rates,
 )
@@ -107,12 +107,20 @@ class PeopleFit:
         usual: (E + 1, H, 2) constant and slope of the logarithm of an expert's mean error over the
             pace of a face, by the logarithm of that pace over ``pace``; the last is the mixture.
         pace: median mean step of the mouth, in face sides.
+        unlearnt: frames at the beginning of a track from whose forecasts nothing is learnt, as
+            they were made as if the face had been at rest before.
     """
 
     horizons: NDArray[np.int64]
     linear: tuple[LinearFit, ...]
     usual: Floats
     pace: float
+    unlearnt: int = 0
+
+    @property
+    def recent(self) -> int:
+        """W, recent frames that a forecast is made from."""
+        return frames_needed(fit.expert for fit in self.linear)
 
     def until(self, horizon: int) -> PeopleFit:
         """Return the part that forecasts ``horizon`` frames ahead: the first band, or both."""
@@ -120,7 +128,9 @@ class PeopleFit:
         if count is None:
             return self
         linear = tuple(replace(fit, people=fit.people[:count]) for fit in self.linear)
-        return PeopleFit(self.horizons[:count], linear, self.usual[:, :count], self.pace)
+        return replace(
+            self, horizons=self.horizons[:count], linear=linear, usual=self.usual[:, :count]
+        )
 
     def usual_errors(self, pace: Floats) -> Floats:
         """Errors (N, E + 1, H) that faces with a pace (N,) make usual, in face sides."""
@@ -182,8 +192,8 @@ class Mixture:
 
     def known(self) -> NDArray[np.int64]:
         """Horizons (K,) whose forecast was made from a frame that was seen."""
-        horizons = self.fit.horizons
-        return horizons[: int(np.searchsorted(horizons, self.frames - 1, side="right"))]
+        horizons, oldest = self.fit.horizons, self.frames - 1 - self.fit.unlearnt
+        return horizons[: int(np.searchsorted(horizons, oldest, side="right"))]
 
     def expected_errors(self) -> tuple[Floats, Floats]:
         """Mean errors so far of the experts (N, E, H) and of the mixture (N, H)."""
@@ -272,7 +282,7 @@ class FaceState:
         self.fit, self.mixture = fit, Mixture(fit, faces)
         top = int(fit.horizons[-1])
         series = fit.linear[0].people.shape[-1]
-        self._recent = np.zeros((faces, max(RECENT, top + 1), series))
+        self._recent = np.zeros((faces, max(fit.recent, top + 1), series))
         self._slow = np.zeros((faces, len(SLOW), series))
         bands = [band for band in BANDS if band.knots.start < len(fit.horizons)]
         self._learners = [_Learner(part, faces, bands, fit.horizons) for part in fit.linear]
@@ -307,7 +317,7 @@ class FaceState:
 
     def forecast(self, recent: Floats | None = None) -> StateForecast:
         """Forecast from the newest frame, or from other ``recent`` frames (N, W, D)."""
-        recent = self._recent[:, -RECENT:] if recent is None else recent
+        recent = self.recent(self.fit.recent) if recent is None else recent
         features = tuple(learner.features(recent, self._slow) for learner in self._learners)
         experts = np.stack(
             [learner.forecast(own) for learner, own in zip(self._learners, features, strict=True)],

@@ -10,6 +10,7 @@ Shapes: N faces or rows, W recent frames, M slow means, D series, F features, H 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,8 +23,6 @@ SHAPES = 8
 """K: principal shapes; a rigid head that moves parallel to the image has two."""
 SERIES = 2 + SHAPES
 """D."""
-RECENT = 5
-"""W: frames that features are made from beside the slow means."""
 SLOW = (10.0, 40.0)
 """Time constants of the slow means in frames: a third of a second, and 1.3 s."""
 
@@ -39,12 +38,16 @@ class LinearExpert:
         iterated: whether it forecasts one frame, and from that the next, as the baseline
             `ar_landmarks` does. Such an expert sees no places and does not adapt; the others keep
             learning from the face that they watch.
+        differences: whether its lags are differences of increasing order instead: the last
+            displacement, how much larger it is than the one before, and so on. Where nothing
+            jitters the displacements are nearly alike, and a fit cannot tell them apart.
     """
 
     shapes: int
     lags: int
     places: int
     iterated: bool = False
+    differences: bool = False
 
     @property
     def columns(self) -> list[int]:
@@ -66,10 +69,21 @@ EXPERTS = (
 """Chosen on folds of the development clips; docs/predictors.md has what each is worth."""
 
 
+def frames_needed(experts: Iterable[LinearExpert]) -> int:
+    """Return W, the recent frames whose displacements the experts see."""
+    return max(expert.lags for expert in experts) + 1
+
+
 def linear_features(expert: LinearExpert, recent: Floats, slow: Floats) -> Floats:
     """Features (N, F) of recent frames (N, W, D), the newest last, and slow means (N, M, D)."""
     seen = recent[..., expert.columns]
     steps = np.diff(seen[:, -expert.lags - 1 :], axis=1)
+    if expert.differences:
+        orders = [steps[:, -1]]
+        for _ in range(1, expert.lags):
+            steps = steps[:, 1:] - steps[:, :-1]
+            orders.append(steps[:, -1])
+        steps = np.stack(orders, axis=1)
     place = seen[:, -1:] - slow[:, : expert.places, expert.columns]
     return np.concatenate([steps, place], axis=1).reshape(len(recent), -1)
 
@@ -89,7 +103,7 @@ def slow_means(series: Floats) -> Floats:
     return means
 
 
-def recent_frames(series: Floats) -> Floats:
-    """The last frames (T, W, D) at every frame of a track (T, D), which began at rest."""
-    padded = np.concatenate([np.repeat(series[:1], RECENT - 1, axis=0), series])
-    return np.lib.stride_tricks.sliding_window_view(padded, RECENT, axis=0).swapaxes(1, 2)
+def recent_frames(series: Floats, count: int) -> Floats:
+    """The last ``count`` frames (T, W, D) at every frame of a track (T, D), which began at rest."""
+    padded = np.concatenate([np.repeat(series[:1], count - 1, axis=0), series])
+    return np.lib.stride_tricks.sliding_window_view(padded, count, axis=0).swapaxes(1, 2)

@@ -33,6 +33,7 @@ from face_prediction.models.residual.experts import (
     SHAPES,
     Floats,
     LinearExpert,
+    frames_needed,
     linear_features,
     recent_frames,
     slow_means,
@@ -50,7 +51,8 @@ from face_prediction.models.residual.predictor import (
 )
 from robo_manip_baselines.runs.errors import RequestError
 
-_RIDGE = 3e-3  # share of the features' mean square added to the diagonal
+RIDGE = 3e-3
+"""Share of the features' mean square that is added to the diagonal."""
 _ROUNDS = 4  # of reweighting from least squares to least absolute error
 _SMALL_ERROR = 1e-3  # face sides: errors below it count alike
 _STILL = 1e-3  # face sides: a track with this mean step of the mouth counts half
@@ -87,15 +89,15 @@ class Rows:
     pace: Floats
 
     @classmethod
-    def of(cls, tracks: Sequence[Floats], subjects: Sequence[str]) -> Rows:
-        """Put tracks (T, D) one after another."""
+    def of(cls, tracks: Sequence[Floats], subjects: Sequence[str], recent: int) -> Rows:
+        """Put tracks (T, D) one after another, with W = ``recent``."""
         lengths = [len(track) for track in tracks]
         people = np.unique(np.asarray(subjects), return_inverse=True)[1]
         paces = [np.abs(np.diff(track[:, :2], axis=0)).mean() for track in tracks]
         numbers = np.repeat(np.arange(len(tracks)), lengths)
         return cls(
             series=np.concatenate(tracks),
-            recent=np.concatenate([recent_frames(track) for track in tracks]),
+            recent=np.concatenate([recent_frames(track, recent) for track in tracks]),
             slow=np.concatenate([slow_means(track) for track in tracks]),
             person=people[numbers],
             seen=np.concatenate([np.arange(n) for n in lengths]),
@@ -113,19 +115,22 @@ def fit_people(
     tracks: Sequence[Floats],
     subjects: Sequence[str],
     experts: Sequence[LinearExpert] = EXPERTS,
+    ridge: float = RIDGE,
 ) -> PeopleFit:
     """Fit experts to tracks (T, D) of people.
 
     All errors count as alike: `fit_residual` measures them.
     """
-    rows, knots = Rows.of(tracks, subjects), np.array(HORIZONS)
-    linear = tuple(fit_linear(expert, rows, knots) for expert in experts)
+    rows, knots = Rows.of(tracks, subjects, frames_needed(experts)), np.array(HORIZONS)
+    linear = tuple(fit_linear(expert, rows, knots, ridge) for expert in experts)
     growth = np.log(np.tile(knots.astype(np.float64), (len(experts) + 1, 1)))
     usual = np.stack([growth, np.zeros_like(growth)], axis=-1)
     return PeopleFit(knots, linear, usual, float(np.median(rows.pace[rows.seen == 0])))
 
 
-def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) -> LinearFit:
+def fit_linear(
+    expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64], ridge: float
+) -> LinearFit:
     """Fit one expert: scale, people's coefficients, and spread between people."""
     features = linear_features(expert, rows.recent, rows.slow)
     scale = features.std(axis=0) + 1e-9
@@ -135,12 +140,13 @@ def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) ->
     usual = [band.usual for band in BANDS]
     precision = np.empty((len(BANDS), size, size))
     if expert.iterated:
-        return LinearFit(expert, scale, iterated(expert, features, scale, rows, horizons), None)
+        moved = iterated(expert, features, scale, rows, horizons, ridge)
+        return LinearFit(expert, scale, moved, None)
     for place, horizon in enumerate(horizons.tolist()):
         origins = rows.origins(horizon)
         x = features[origins]
         y = rows.series[origins + horizon] - rows.series[origins]
-        people[place] = least_absolute(x, y, rows.pace[origins])
+        people[place] = least_absolute(x, y, rows.pace[origins], ridge)
         if place in usual:
             rest = (y - x @ people[place])[:, :2]
             precision[usual.index(place)] = spread(x, rest, rows.person[origins], horizon)
@@ -148,7 +154,12 @@ def fit_linear(expert: LinearExpert, rows: Rows, horizons: NDArray[np.int64]) ->
 
 
 def iterated(
-    expert: LinearExpert, features: Floats, scale: Floats, rows: Rows, horizons: NDArray[np.int64]
+    expert: LinearExpert,
+    features: Floats,
+    scale: Floats,
+    rows: Rows,
+    horizons: NDArray[np.int64],
+    ridge: float,
 ) -> Floats:
     """Coefficients (H, F, D) of an autoregression that is iterated.
 
@@ -158,11 +169,12 @@ def iterated(
         scale: (F,).
         rows: of all tracks.
         horizons: (H,).
+        ridge: see `RIDGE`.
     """
     origins = rows.origins(1)
     x = features[origins]
     y = rows.series[origins + 1] - rows.series[origins]
-    step = least_absolute(x, y, rows.pace[origins])  # (F, D)
+    step = least_absolute(x, y, rows.pace[origins], ridge)  # (F, D)
     kept = len(expert.columns)
     onward = np.zeros((expert.size, expert.size))  # features of the next frame from these
     onward[kept:, :-kept] = np.diag(scale[kept:] / scale[:-kept])
@@ -177,11 +189,11 @@ def iterated(
     return moved
 
 
-def least_absolute(x: Floats, y: Floats, pace: Floats) -> Floats:
+def least_absolute(x: Floats, y: Floats, pace: Floats, ridge: float) -> Floats:
     """Coefficients (F, D) of the least absolute error of y's first two columns, the mouth.
 
     Errors below `_SMALL_ERROR` count alike, and rows of tracks whose ``pace`` (N,) is far below
-    `_STILL` little.
+    `_STILL` little. ``ridge``: see `RIDGE`.
     """
     weight = used = pace / (pace + _STILL)
     solution = np.zeros((x.shape[1], y.shape[1]))
@@ -191,7 +203,7 @@ def least_absolute(x: Floats, y: Floats, pace: Floats) -> Floats:
             used = weight / np.sqrt(error**2 + _SMALL_ERROR**2)
             used = used / used.mean()
         weighted = x * used[:, None]
-        gram = weighted.T @ x + _RIDGE * len(x) * np.eye(x.shape[1])
+        gram = weighted.T @ x + ridge * len(x) * np.eye(x.shape[1])
         solution = np.linalg.solve(gram, weighted.T @ y)
     return solution
 
@@ -337,7 +349,7 @@ def mix_again(
         where there is none.
     """
     order = sorted(range(len(tracks)), key=lambda number: -len(tracks[number]))
-    recent = [recent_frames(track[:, :2]) for track in tracks]
+    recent = [recent_frames(track[:, :2], people.recent) for track in tracks]
     signs = [np.empty((len(track), len(HORIZONS), SIGNS)) for track in tracks]
     moved = [np.empty((len(track), len(HORIZONS), 2)) for track in tracks]
     mixture = Mixture(people, len(order))

@@ -1,10 +1,10 @@
 """Residual prediction of a mouth whose place is known in metres, without landmarks or images.
 
-The mouth is that of a face that moves as one piece. Across the view it is followed as in an image;
-its depth is followed as a second face, which moves along one axis only. Both have the coefficients
-of the same people, and each learns from what it does itself.
+Across the view the mouth is followed as in an image; its depth is followed as a second mouth, which
+moves along one axis only. Both have the coefficients of the same people, and each learns from what
+it does itself. Nothing need jitter here as landmarks do, so that experts see more of the past.
 
-Shapes: E people, T frames of 1/30 s, W recent frames, H horizon, D series. The first axis of a path
+Shapes: E people, T frames of 1/30 s, W recent frames, H horizon, K knots. The first axis of a path
 is the depth, the other two lie across the view.
 """
 
@@ -16,16 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from face_prediction.models.residual.adaptive import FaceState, PeopleFit
-from face_prediction.models.residual.experts import EXPERTS as FACE_EXPERTS
-from face_prediction.models.residual.experts import RECENT, SHAPES, Floats
+from face_prediction.models.residual.experts import SHAPES, Floats, LinearExpert
 from face_prediction.models.residual.fit import fit_people, trial, usual_errors
 from face_prediction.models.residual.intervals import IntervalFit
-from face_prediction.models.residual.predictor import ResidualFit, every_frame, require_horizon
+from face_prediction.models.residual.predictor import HORIZON, ResidualFit, require_horizon
 from face_prediction.tracking.tracks import NUM_LANDMARKS
 from robo_manip_baselines.runs.errors import RequestError
 
-EXPERTS = tuple(replace(expert, shapes=min(expert.shapes, 2)) for expert in FACE_EXPERTS)
-"""A face that moves as one piece has two principal shapes, its translations across the view."""
+EXPERTS = (
+    LinearExpert(0, 1, 0, iterated=True),
+    LinearExpert(0, 8, 2, differences=True),
+    LinearExpert(0, 4, 2, differences=True),
+)
+"""Chosen, as `RIDGE` is, by the errors on dyskinetic, sway and recorded motion."""
+
+RIDGE = 1e-6
+"""Less than a face's: it has only to keep the fit from failing where a motion is exactly linear."""
 
 FACE_SIDE = 0.21
 """m, side of a crop around a face: the median of the shipped motion library."""
@@ -42,26 +48,34 @@ class PathPredictor:
 
     Attributes:
         people: experts' coefficients and errors.
-        recent: W, frames that a forecast is made from, beside what was learnt.
+        between: (24, K) forecasts in every frame ahead of those at knots, cubic splines between
+            them that begin at the newest frame: a mouth that moves fast turns within them.
     """
 
     people: PeopleFit
-    recent: int = RECENT
+    between: Floats
+
+    @property
+    def recent(self) -> int:
+        """W, frames that a forecast is made from, beside what was learnt."""
+        return self.people.recent
 
     def follow(self) -> FollowedPath:
         """Return the state of a mouth that is seen for the first time."""
-        return FollowedPath(self.people)
+        return FollowedPath(self)
 
 
 class FollowedPath:
     """State of a mouth that is followed from frame to frame.
 
+    Until it was seen in W frames it is forecast to stay: nobody knows how it moved before.
+
     Args:
-        people: fit of the training people.
+        predictor: fitted to the training people.
     """
 
-    def __init__(self, people: PeopleFit) -> None:
-        self._state, self._knots = FaceState(people, 2), people.horizons
+    def __init__(self, predictor: PathPredictor) -> None:
+        self._predictor, self._state = predictor, FaceState(predictor.people, 2)
 
     def update(self, mouth: NDArray[np.floating]) -> None:
         """Take in the mouth (3,) m in the next frame, 1/30 s after the one before."""
@@ -77,8 +91,12 @@ class FollowedPath:
             RequestError: the horizon is longer than 24.
         """
         require_horizon(horizon)
-        made = self._state.forecast(path_series(recent)).moved[..., :2]
-        across, depth = FACE_SIDE * every_frame(made, self._knots, horizon)
+        if self._state.mixture.frames < self._predictor.recent:
+            return np.repeat(recent[-1:], horizon, axis=0)
+        knots = self._state.forecast(path_series(recent)).moved
+        # Summed by NumPy itself in a fixed order: BLAS rounds otherwise for another horizon.
+        ahead = np.einsum("hk,nkd->nhd", self._predictor.between[:horizon], knots)
+        across, depth = FACE_SIDE * ahead
         return recent[-1] + np.column_stack([depth[:, 0], across])
 
 
@@ -91,6 +109,8 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
     Raises:
         RequestError: they are fewer than four.
     """
+    from scipy.interpolate import CubicSpline  # slow to import
+
     if len(paths) < LEAST_PEOPLE:
         raise RequestError(f"paths of {len(paths)} people; residual needs {LEAST_PEOPLE} or more")
     count = 3 * len(paths) // 4
@@ -98,9 +118,10 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
         [series for path in part for series in path_series(path)]
         for part in (paths[:count], paths[count:])
     )
-    people = fit_people(fitted, [str(number // 2) for number in range(len(fitted))], EXPERTS)
+    people = fit_people(fitted, [str(number // 2) for number in range(len(fitted))], EXPERTS, RIDGE)
     people = replace(
         people,
+        unlearnt=people.recent - 1,
         linear=tuple(
             replace(
                 fit,
@@ -114,18 +135,16 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
     tried = trial(ResidualFit(no_shapes, people, IntervalFit.unknown()), held_out)
     made, mixed = ([pair[part] for pair in tried] for part in range(2))
     usual = usual_errors(made, mixed, held_out, people.pace)
-    return PathPredictor(replace(people, usual=_rounded(usual)))
+    knots = np.concatenate([[0], people.horizons])
+    spline = CubicSpline(knots, np.eye(len(knots)))
+    between = spline(np.arange(1, HORIZON + 1))[:, 1:]
+    return PathPredictor(replace(people, usual=_rounded(usual)), between)
 
 
 def path_series(path: NDArray[np.floating]) -> Floats:
-    """Series (2, T, 4) in face sides of a path (T, 3) m: across the view, and of the depth.
-
-    The mouth, and the shapes, which move as it does.
-    """
-    series = np.zeros((2, len(path), 4))
-    series[0, :, :2] = path[:, 1:]
-    series[1, :, 0] = path[:, 0]
-    series[..., 2:] = series[..., :2]
+    """Series (2, T, 2) in face sides of a path (T, 3) m: across the view, and of the depth."""
+    series = np.zeros((2, len(path), 2))
+    series[0], series[1, :, 0] = path[:, 1:], path[:, 0]
     return series / FACE_SIDE
 
 

@@ -25,10 +25,10 @@ from face_prediction.models.residual.adaptive import (
 )
 from face_prediction.models.residual.experts import (
     EXPERTS,
-    RECENT,
     SERIES,
     SHAPES,
     Floats,
+    frames_needed,
 )
 from face_prediction.models.residual.intervals import (
     LEVELS,
@@ -216,7 +216,7 @@ class ResidualPredictor:
     memory = None
     needs = ImageNeeds(frames=0, size=0)
     horizon = HORIZON
-    recent = RECENT
+    recent = frames_needed(EXPERTS)
 
     def __init__(self, fit: ResidualFit) -> None:
         self.fit = fit
