@@ -29,6 +29,9 @@ from robo_manip_baselines.runs.documents import convert
 from robo_manip_baselines.runs.errors import RequestError
 from robo_manip_baselines.runs.ranges import Seed
 
+READ_TOGETHER = 64
+"""Episodes whose target is forecast side by side, which is faster than one after another."""
+
 
 def recorded_state(episode: EpisodeReader) -> State:
     """Read the (T, ...) state of an episode of one arm or of both.
@@ -230,44 +233,47 @@ def load_demonstrations(
     paths = _episode_paths(env or folder.name, folder, spec, limit)
     spec = _drawn_as_recorded(spec, read_metadata(paths[0]))
     forecast = _forecaster(paths[0], spec)
-    states: list[NDArray[np.float32]] = []
+    packed: list[NDArray[np.float32]] = []
     actions: list[NDArray[np.float32]] = []
     attributes: list[dict[str, Any]] = []
     interventions: list[NDArray[np.bool_]] = []
     has_interventions = False
-    for path in paths:
-        with EpisodeReader(path) as episode:
-            attributes.append(episode.attributes)
-            _require_same(paths[0], attributes[0], path, attributes[-1])
-            _require_spec(episode, spec)
-            state, target = recorded_state(episode), None
-            if pipeline:
-                if forecast:
-                    made = forecast(state.target_position, attributes[-1]["seed"])
-                    state = replace(state, predicted_target=made)
-                target = pipeline.observe_episode(state, attributes[-1]["seed"])
-            states.append(spec.pack(state, target))
-            actions.append(episode.array("action").astype(np.float32))
-            is_shared = "intervention" in episode.fields
-            has_interventions = has_interventions or is_shared
-            marked = episode.array("intervention") if is_shared else np.zeros(len(episode), bool)
-            interventions.append(marked)
+    for first in range(0, len(paths), READ_TOGETHER):
+        states: list[State] = []
+        for path in paths[first : first + READ_TOGETHER]:
+            with EpisodeReader(path) as episode:
+                attributes.append(episode.attributes)
+                _require_same(paths[0], attributes[0], path, attributes[-1])
+                _require_spec(episode, spec)
+                states.append(recorded_state(episode))
+                actions.append(episode.array("action").astype(np.float32))
+                is_shared = "intervention" in episode.fields
+                has_interventions = has_interventions or is_shared
+                nobody = np.zeros(len(episode), bool)
+                interventions.append(episode.array("intervention") if is_shared else nobody)
+        seeds = [item["seed"] for item in attributes[first:]]
+        if forecast:
+            made = forecast([state.target_position for state in states], seeds)
+            states = [replace(s, predicted_target=m) for s, m in zip(states, made, strict=True)]
+        for state, seed in zip(states, seeds, strict=True):
+            target = pipeline.observe_episode(state, seed) if pipeline else None
+            packed.append(spec.pack(state, target))
     lengths = np.array([len(action) for action in actions], dtype=np.int64)
     hashes = "\n".join(item["content_sha256"] for item in attributes)
-    first = attributes[0]
+    shared = attributes[0]
     return Demonstrations(
         paths=tuple(paths),
         seeds=tuple(item["seed"] for item in attributes),
         lengths=lengths,
         offsets=np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)]),
-        state=np.concatenate(states),
+        state=np.concatenate(packed),
         action=np.concatenate(actions),
         spec=spec,
-        env_id=first["env_id"],
-        action_names=tuple(first["action_names"]),
-        control_period=first["control_period"],
-        xml_hash=first["xml_hash"],
-        env_kwargs=_world(first),
+        env_id=shared["env_id"],
+        action_names=tuple(shared["action_names"]),
+        control_period=shared["control_period"],
+        xml_hash=shared["xml_hash"],
+        env_kwargs=_world(shared),
         content_hash=hashlib.sha256(hashes.encode()).hexdigest(),
         intervention=np.concatenate(interventions) if has_interventions else None,
     )
@@ -333,8 +339,8 @@ def _frames_ahead(episode: EpisodeReader) -> tuple[int, int]:
 
 def _forecaster(
     path: Path, spec: ObservationSpec
-) -> Callable[[NDArray[np.float64], int], NDArray[np.float64]] | None:
-    """Return what makes a forecaster's output of track and seed; None where none is observed.
+) -> Callable[[list[NDArray[np.float64]], list[int]], list[NDArray[np.float64]]] | None:
+    """Return what makes a forecaster's output of tracks and seeds; None where none is observed.
 
     Raises:
         RequestError: the episodes have no such forecasts.
@@ -348,7 +354,7 @@ def _forecaster(
         episode.task.require_forecasts(spec)
         made = MotionForecasters.of_kwargs(episode.attributes["env_kwargs"])
         made.require(name)
-    return lambda track, seed: made.forecast_track(name, track, seed)
+    return lambda tracks, seeds: made.forecast_tracks(name, tracks, seeds)
 
 
 def _require_spec(episode: EpisodeReader, spec: ObservationSpec) -> None:

@@ -23,15 +23,16 @@ def predictor() -> PathPredictor:
     return fit_paths(swaying(8))
 
 
-def forecasts(predictor: PathPredictor, path: np.ndarray, horizon: int = 24) -> np.ndarray:
-    """Forecasts (T, H, 3) m from every frame of a path (T, 3) m."""
-    follower = predictor.follow()
-    rested = np.concatenate([np.repeat(path[:1], predictor.recent - 1, axis=0), path])
+def forecasts(predictor: PathPredictor, *paths: np.ndarray) -> np.ndarray:
+    """Forecasts (T, 24, 3) m from every frame of a path (T, 3) m; of several, one after another."""
+    together = np.stack(paths)
+    follower, recent = predictor.follow(len(paths)), predictor.recent
+    rested = np.concatenate([np.repeat(together[:, :1], recent - 1, axis=1), together], axis=1)
     made = []
-    for frame, mouth in enumerate(path):
-        follower.update(mouth)
-        made.append(follower.forecast(rested[frame : frame + predictor.recent], horizon))
-    return np.array(made)
+    for frame in range(together.shape[1]):
+        follower.update(together[:, frame])
+        made.append(follower.forecast(rested[:, frame : frame + recent], 24))
+    return np.concatenate(np.stack(made, axis=1))
 
 
 def test_axes_are_followed_each_by_the_same_people(predictor: PathPredictor) -> None:
@@ -50,7 +51,7 @@ def test_axes_are_followed_each_by_the_same_people(predictor: PathPredictor) -> 
 def test_a_mouth_across_is_a_face_of_that_side(predictor: PathPredictor) -> None:
     path = swaying(1, 60, seed=2)[0]
     state = FaceState(predictor.people, 1)
-    for series in path_series(path)[0]:
+    for series in path_series(path[None])[0]:
         state.take(series[None])
         made = state.forecast()
         state.remember(made)
@@ -64,6 +65,13 @@ def test_another_place_is_no_other_motion(predictor: PathPredictor) -> None:
     place = np.array([0.4, -0.2, 0.3])
     there = forecasts(predictor, path + place) - place
     np.testing.assert_allclose(there, forecasts(predictor, path), atol=1e-9)
+
+
+def test_mouths_are_followed_side_by_side_as_alone(predictor: PathPredictor) -> None:
+    """Bit for bit: what a training reads is what the environment forecasts."""
+    paths = swaying(5, 50, seed=7)
+    alone = np.concatenate([forecasts(predictor, path) for path in paths])
+    np.testing.assert_array_equal(forecasts(predictor, *paths), alone)
 
 
 def test_a_still_mouth_stays(predictor: PathPredictor) -> None:
@@ -104,4 +112,4 @@ def test_too_few_people_or_too_far_ahead_are_refused(predictor: PathPredictor) -
     with pytest.raises(RequestError, match="paths of 3 people; residual needs 4"):
         fit_paths(swaying(3))
     with pytest.raises(RequestError, match="horizon 25"):
-        predictor.follow().forecast(np.zeros((5, 3)), 25)
+        predictor.follow().forecast(np.zeros((1, 9, 3)), 25)

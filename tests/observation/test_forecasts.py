@@ -21,7 +21,7 @@ from robo_manip_baselines.envs.mujoco.face.forecasters import (
     FIT_EPISODES,
     LINEAR,
     MotionForecasters,
-    follow_track,
+    follow_tracks,
     frames_seen,
 )
 from robo_manip_baselines.envs.mujoco.face.motion import MotionLibrary
@@ -304,19 +304,21 @@ def test_a_predictor_takes_in_frames_and_forecasts_at_control_steps() -> None:
             self.taken: list[np.ndarray] = []
             self.asked: list[tuple[int, np.ndarray]] = []
 
-        def follow(self) -> Predictor:
+        def follow(self, mouths: int) -> Predictor:
+            assert mouths == 2
             return self
 
-        def update(self, mouth: np.ndarray) -> None:
-            self.taken.append(mouth)
+        def update(self, mouths: np.ndarray) -> None:
+            self.taken.append(mouths[0])
 
         def forecast(self, recent: np.ndarray, horizon: int) -> np.ndarray:
-            self.asked.append((len(self.taken), recent))
-            return np.full((horizon, 3), float(len(self.asked)))
+            self.asked.append((len(self.taken), recent[0]))
+            return np.full((2, horizon, 3), float(len(self.asked)))
 
     path, predictor = motion_of("dyskinetic"), Predictor()
-    made = follow_track(predictor, track_of(path, 101))
+    made, shorter = follow_tracks(predictor, [track_of(path, 101), track_of(path, 80)])
     np.testing.assert_array_equal(made[:, 0, 0], np.arange(1, 102))
+    np.testing.assert_array_equal(shorter, made[:80])
     frames = np.arange(61) * FRAME_PERIOD  # until 2 s
     np.testing.assert_allclose(predictor.taken, path(frames), atol=EXACT)
     for step, (taken, recent) in enumerate(predictor.asked):

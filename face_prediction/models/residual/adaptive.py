@@ -363,10 +363,15 @@ class Ring:
         """The row (N, ...) of an age, 1 being the newest."""
         return self._rows[(self._count - age) % len(self._rows)]
 
+    def rows(self, ages: NDArray[np.int64]) -> Floats:
+        """The rows (K, N, ...) of ages (K,)."""
+        return self._rows[(self._count - ages) % len(self._rows)]
+
     def of_horizons(self, ages: NDArray[np.int64], axis: int = 0) -> Floats:
         """Of each row of ``ages`` (K,) its own horizon: the k-th along ``axis`` after the faces."""
-        rows = [np.take(self.row(age), k, axis=axis + 1) for k, age in enumerate(ages.tolist())]
-        return np.stack(rows, axis=axis + 1)
+        rows, own = self.rows(ages), np.arange(len(ages))
+        chosen = np.moveaxis(rows, axis + 2, 1)[own, own]  # (K, N, ...)
+        return np.moveaxis(chosen, 0, axis + 1)
 
 
 class _Learner:
@@ -389,7 +394,7 @@ class _Learner:
         self._people = fit.people.swapaxes(0, 1).reshape(size, -1)
         self._past, self._made = (
             Ring(top, (faces, size)),
-            Ring(top, (faces, self._people.shape[1])),
+            Ring(top, (faces, len(horizons), self._series)),
         )
         self._weights = [Ring(top, (faces,)) for _ in bands]
         if fit.precision is None:
@@ -421,21 +426,24 @@ class _Learner:
     def remember(self, features: Floats) -> None:
         """Keep the features (N, F) of a forecast, to learn from its outcome."""
         self._past.push(features)
-        self._made.push(features @ self._people)
+        self._made.push(self._of_people(features))
 
     def forecast(self, features: Floats) -> Floats:
         """Displacements (N, H, D) from scaled features (N, F)."""
-        size = len(features), len(self._horizons), self._series
-        result = (features @ self._people).reshape(size)
+        result = self._of_people(features)
         if self.fit.precision is None:
             return result
         for band, inverse in zip(self._bands, self._inverse, strict=True):
-            first = int(self._horizons[band.knots.start])
-            for place in range(band.knots.start, band.knots.stop):
-                before = inverse.row(int(self._horizons[place]) - first + 1)
-                gain = (features[:, None] @ before) @ self._cross[place]
-                result[:, place] += gain[:, 0]
+            own = self._horizons[band.knots]
+            gain = (features[:, None] @ inverse.rows(own - own[0] + 1)) @ self._cross[band.knots]
+            result[:, band.knots] += gain[:, :, 0].swapaxes(0, 1)
         return result
+
+    def _of_people(self, features: Floats) -> Floats:
+        """Displacements (N, H, D) by the training people's coefficients."""
+        size = len(features), len(self._horizons), self._series
+        # Face by face, as BLAS rounds otherwise for another number of them.
+        return (features[:, None] @ self._people).reshape(size)
 
     def learn(
         self, errors: Floats, expected: Floats, truth: Floats, ages: NDArray[np.int64]
@@ -450,7 +458,7 @@ class _Learner:
         """
         if self.fit.precision is None:
             return
-        memory = np.exp(-1 / LEARNT_MEMORY)
+        memory, people = np.exp(-1 / LEARNT_MEMORY), self._made.of_horizons(ages)
         for number, band in enumerate(self._bands):
             first, stop = band.knots.start, min(band.knots.stop, len(ages))
             if first >= stop:
@@ -464,15 +472,12 @@ class _Learner:
             gram *= memory
             gram += weighted[..., None] * row[:, None]
             self._inverse[number].push(np.linalg.inv(gram + self.fit.precision[number]))
-            for place in range(first, stop):
-                age = int(ages[place])
-                own = slice(place * self._series, (place + 1) * self._series)
-                people = self._made.row(age)[:, own]
-                missed = truth[:, place] - people
-                weight = self._weights[number].row(age - int(ages[first]) + 1)
-                cross = self._cross[place]
-                cross *= memory
-                cross += (weight[:, None] * self._past.row(age))[..., None] * missed[:, None]
+            decided = ages[first:stop]
+            missed = (truth - people)[:, first:stop].swapaxes(0, 1)
+            weights = self._weights[number].rows(decided - decided[0] + 1)
+            cross = self._cross[first:stop]
+            cross *= memory
+            cross += (weights[..., None] * self._past.rows(decided))[..., None] * missed[:, :, None]
 
 
 LATE_MEMORY = 8.0

@@ -4,8 +4,8 @@ Across the view the mouth is followed as in an image; its depth is followed as a
 moves along one axis only. Both have the coefficients of the same people, and each learns from what
 it does itself. Nothing need jitter here as landmarks do, so that experts see more of the past.
 
-Shapes: E people, T frames of 1/30 s, W recent frames, H horizon, K knots. The first axis of a path
-is the depth, the other two lie across the view.
+Shapes: E people, N mouths, T frames of 1/30 s, W recent frames, H horizon, K knots. The first axis
+of a path is the depth, the other two lie across the view.
 """
 
 from __future__ import annotations
@@ -60,30 +60,31 @@ class PathPredictor:
         """W, frames that a forecast is made from, beside what was learnt."""
         return self.people.recent
 
-    def follow(self) -> FollowedPath:
-        """Return the state of a mouth that is seen for the first time."""
-        return FollowedPath(self)
+    def follow(self, mouths: int = 1) -> FollowedPaths:
+        """Return the state of N mouths that are seen for the first time."""
+        return FollowedPaths(self, mouths)
 
 
-class FollowedPath:
-    """State of a mouth that is followed from frame to frame.
+class FollowedPaths:
+    """State of mouths that are followed from frame to frame, each by itself.
 
-    Until it was seen in W frames it is forecast to stay: nobody knows how it moved before.
+    Until they were seen in W frames they are forecast to stay: nobody knows how they moved before.
 
     Args:
         predictor: fitted to the training people.
+        mouths: N.
     """
 
-    def __init__(self, predictor: PathPredictor) -> None:
-        self._predictor, self._state = predictor, FaceState(predictor.people, 2)
+    def __init__(self, predictor: PathPredictor, mouths: int) -> None:
+        self._predictor, self._state = predictor, FaceState(predictor.people, 2 * mouths)
 
-    def update(self, mouth: NDArray[np.floating]) -> None:
-        """Take in the mouth (3,) m in the next frame, 1/30 s after the one before."""
-        self._state.take(path_series(mouth[None])[:, 0])
+    def update(self, mouths: NDArray[np.floating]) -> None:
+        """Take in the mouths (N, 3) m in the next frame, 1/30 s after the one before."""
+        self._state.take(path_series(mouths[:, None])[:, 0])
         self._state.remember(self._state.forecast())
 
     def forecast(self, recent: NDArray[np.floating], horizon: int) -> Floats:
-        """Return the mouth (H, 3) m in the frames after ``recent`` (W, 3), the newest last.
+        """Return the mouths (N, H, 3) m in the frames after ``recent`` (N, W, 3), the newest last.
 
         These are 1/30 s apart, and need not be frames that were taken in.
 
@@ -92,12 +93,12 @@ class FollowedPath:
         """
         require_horizon(horizon)
         if self._state.mixture.frames < self._predictor.recent:
-            return np.repeat(recent[-1:], horizon, axis=0)
+            return np.repeat(recent[:, -1:], horizon, axis=1)
         knots = self._state.forecast(path_series(recent)).moved
         # Summed by NumPy itself in a fixed order: BLAS rounds otherwise for another horizon.
         ahead = np.einsum("hk,nkd->nhd", self._predictor.between[:horizon], knots)
-        across, depth = FACE_SIDE * ahead
-        return recent[-1] + np.column_stack([depth[:, 0], across])
+        across, depth = FACE_SIDE * ahead[::2], FACE_SIDE * ahead[1::2]
+        return recent[:, -1:] + np.concatenate([depth[..., :1], across], axis=-1)
 
 
 def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
@@ -114,10 +115,7 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
     if len(paths) < LEAST_PEOPLE:
         raise RequestError(f"paths of {len(paths)} people; residual needs {LEAST_PEOPLE} or more")
     count = 3 * len(paths) // 4
-    fitted, held_out = (
-        [series for path in part for series in path_series(path)]
-        for part in (paths[:count], paths[count:])
-    )
+    fitted, held_out = (list(path_series(part)) for part in (paths[:count], paths[count:]))
     people = fit_people(fitted, [str(number // 2) for number in range(len(fitted))], EXPERTS, RIDGE)
     people = replace(
         people,
@@ -141,10 +139,10 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
     return PathPredictor(replace(people, usual=_rounded(usual)), between)
 
 
-def path_series(path: NDArray[np.floating]) -> Floats:
-    """Series (2, T, 2) in face sides of a path (T, 3) m: across the view, and of the depth."""
-    series = np.zeros((2, len(path), 2))
-    series[0], series[1, :, 0] = path[:, 1:], path[:, 0]
+def path_series(paths: NDArray[np.floating]) -> Floats:
+    """Series (2 N, T, 2) in face sides of paths (N, T, 3) m: of each across the view, and depth."""
+    series = np.zeros((2 * len(paths), paths.shape[1], 2))
+    series[::2], series[1::2, :, 0] = paths[..., 1:], paths[..., 0]
     return series / FACE_SIDE
 
 

@@ -14,7 +14,7 @@ episode, K frames from now to the longest one known, D state.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -267,36 +267,39 @@ class MotionForecasters:
     def forecast_track(self, name: str, track: Floats, seed: int) -> Floats:
         """Return the forecasts, (T, H, 3) m, made at each control step of an episode.
 
-        They are made of the mouth until then: the same whether ``track`` is of an environment or of
-        an episode file, and up to any step the same whatever follows. Until as many frames have
-        been seen as a forecaster uses, the mouth is forecast to stay where it is.
+        See `forecast_tracks`.
+        """
+        return self.forecast_tracks(name, [track], [seed])[0]
+
+    def forecast_tracks(
+        self, name: str, tracks: Sequence[Floats], seeds: Sequence[int]
+    ) -> list[Floats]:
+        """Return the forecasts, (T, H, 3) m, made at each control step of episodes.
+
+        They are made of the mouth until then: the same whether a track is of an environment or of
+        an episode file, whatever others are forecast with it, and up to any step whatever follows.
+        Until as many frames have been seen as a forecaster uses, the mouth is forecast to stay
+        where it is.
 
         Args:
             name: one of ``FORECASTERS``.
-            track: (T, K, 3) m, the true mouth at each control step now, and in the frames to come,
+            tracks: (T, K, 3) m, the true mouth at each control step now, and in the frames to come,
                 of which those are used that have passed when a forecast is made.
-            seed: of the episode.
+            seeds: of the episodes.
 
         Raises:
             RequestError: there is no such forecaster, or its package is missing.
         """
         require_choice("forecaster", name, FORECASTERS)
         if name == "residual":
-            made = follow_track(_fitted_predictor(self), track)
+            made = follow_tracks(_fitted_predictor(self), tracks)
         elif name == "shuffled":
-            time = _step_times(len(track)) + FRAMES_AHEAD
-            other = self.another_episode(seed).displacement_at(time)
-            made = track[:, :1] + other[:, 1:] - other[:, :1]
+            made = [self._shuffled(*episode) for episode in zip(tracks, seeds, strict=True)]
         else:
-            weights = self.linear(name).weights
-            seen = frames_seen(track, weights.shape[1])
-            # Summed by NumPy itself in a fixed order: BLAS rounds otherwise for another T.
-            made = np.einsum("hnij,tnj->thi", weights[1:], seen)
-            # A mouth that seems to start at once is no motion that anything was fitted to.
-            is_early = _step_times(len(track))[:, 0] < (weights.shape[1] - 1) * FRAME_PERIOD - 1e-6
-            made[is_early] = track[is_early, :1]
+            made = [linear_forecasts(self.linear(name).weights, track) for track in tracks]
         # The face stands still after its motion, and so does the forecast.
-        return made[np.minimum(np.arange(len(track)), round(SEGMENT_DURATION / CONTROL_PERIOD))]
+        last = round(SEGMENT_DURATION / CONTROL_PERIOD)
+        return [own[np.minimum(np.arange(len(own)), last)] for own in made]
 
     def require(self, name: str) -> None:
         """Require what a forecaster needs.
@@ -306,6 +309,11 @@ class MotionForecasters:
         """
         if name == "residual":
             find_path_predictor()
+
+    def _shuffled(self, track: Floats, seed: int) -> Floats:
+        time = _step_times(len(track)) + FRAMES_AHEAD
+        other = self.another_episode(seed).displacement_at(time)
+        return track[:, :1] + other[:, 1:] - other[:, :1]
 
     def _draw(self, seed: int) -> MotionSegment:
         rng = np.random.default_rng(seed)
@@ -331,24 +339,43 @@ def _fitted_predictor(forecasters: MotionForecasters) -> PathPredictor:
     return find_path_predictor()(forecasters.paths())
 
 
-def follow_track(predictor: PathPredictor, track: Floats) -> Floats:
-    """Return the forecasts, (T, H, 3) m, of a predictor that follows the mouth of an episode.
+def linear_forecasts(weights: Floats, track: Floats) -> Floats:
+    """Return the forecasts, (T, H, 3) m, of a linear forecaster at each control step.
+
+    Args:
+        weights: of `LinearForecaster`.
+        track: (T, K, 3) m, as of `MotionForecasters.forecast_tracks`.
+    """
+    seen = frames_seen(track, weights.shape[1])
+    # Summed by NumPy itself in a fixed order: BLAS rounds otherwise for another T.
+    made = np.einsum("hnij,tnj->thi", weights[1:], seen)
+    # A mouth that seems to start at once is no motion that anything was fitted to.
+    is_early = _step_times(len(track))[:, 0] < (weights.shape[1] - 1) * FRAME_PERIOD - 1e-6
+    made[is_early] = track[is_early, :1]
+    return made
+
+
+def follow_tracks(predictor: PathPredictor, tracks: Sequence[Floats]) -> list[Floats]:
+    """Return the forecasts, (T, H, 3) m, of a predictor that follows the mouths of episodes.
 
     It takes in every video frame, and forecasts at every control step from the frames seen.
 
     Args:
         predictor: of paths.
-        track: (T, K, 3) m, as of `MotionForecasters.forecast_track`.
+        tracks: (T, K, 3) m, as of `MotionForecasters.forecast_tracks`.
     """
-    follower, seen = predictor.follow(), frames_seen(track, predictor.recent)
-    made, frame = np.empty((len(track), MAX_LEAD, 3)), 0
+    longest = max(map(len, tracks))
+    held = np.stack([track[np.minimum(np.arange(longest), len(track) - 1)] for track in tracks])
+    seen = np.stack([frames_seen(track, predictor.recent)[:, ::-1] for track in held], axis=1)
+    follower, frame = predictor.follow(len(tracks)), 0
+    made = np.empty((len(tracks), longest, MAX_LEAD, 3))
     for step, recent in enumerate(seen):
         while STEPS_TO_MEET * frame <= FRAMES_TO_MEET * step:
             meeting, later = divmod(frame, FRAMES_TO_MEET)
-            follower.update(track[STEPS_TO_MEET * meeting, later])
+            follower.update(held[:, STEPS_TO_MEET * meeting, later])
             frame += 1
-        made[step] = follower.forecast(recent[::-1], MAX_LEAD)
-    return made
+        made[:, step] = follower.forecast(recent, MAX_LEAD)
+    return [own[: len(track)] for own, track in zip(made, tracks, strict=True)]
 
 
 def _step_times(count: int) -> NDArray[np.floating[Any]]:

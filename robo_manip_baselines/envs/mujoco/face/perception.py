@@ -54,14 +54,14 @@ OpenTracker = Callable[[float, int], MouthTracker]
 
 
 class PathFollower(Protocol):
-    """State of a predictor that follows one mouth through an episode."""
+    """State of a predictor that follows mouths, each through an episode of its own."""
 
-    def update(self, mouth: Floats) -> None:
-        """Take in the mouth (3,) m in the next frame, 1/30 s after the one before."""
+    def update(self, mouths: Floats) -> None:
+        """Take in the mouths (N, 3) m in the next frame, 1/30 s after the one before."""
         ...
 
     def forecast(self, recent: Floats, horizon: int) -> Floats:
-        """Return the mouth (H, 3) m in the frames after ``recent`` (W, 3), the newest last.
+        """Return the mouths (N, H, 3) m in the frames after ``recent`` (N, W, 3), the newest last.
 
         These are 1/30 s apart, and need not be frames that were taken in.
         """
@@ -77,8 +77,8 @@ class PathPredictor(Protocol):
 
     recent: int
 
-    def follow(self) -> PathFollower:
-        """Return the state of a mouth that is seen for the first time."""
+    def follow(self, mouths: int) -> PathFollower:
+        """Return the state of N mouths that are seen for the first time."""
         ...
 
 
