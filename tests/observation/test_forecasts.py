@@ -267,9 +267,9 @@ def test_what_is_fitted_to_is_no_episode_of_anybody_else() -> None:
 
 
 DIGEST = """
-import hashlib
+import hashlib, sys
 from robo_manip_baselines.envs.mujoco.face.forecasters import MotionForecasters
-made = MotionForecasters.of_kwargs({"motion": "dyskinetic", "people": "train"})
+made = MotionForecasters.of_kwargs({"motion": sys.argv[1], "people": "train"})
 for name in ("autoregression", "kalman"):
     print(hashlib.sha256(made.linear(name).weights.tobytes()).hexdigest())
 track = made.paths()[0, :240].reshape(60, 4, 3)  # any numbers, of which four are known at a time
@@ -278,17 +278,18 @@ print(hashlib.sha256(made.forecast_track("residual", track, 0).tobytes()).hexdig
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("motion", ["dyskinetic", "tremor"])
 @pytest.mark.parametrize("threads", ["1", "2"])
-def test_fits_are_the_same_in_every_process(threads: str) -> None:
+def test_fits_are_the_same_in_every_process(threads: str, motion: str) -> None:
     variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     result = subprocess.run(
-        [sys.executable, "-c", DIGEST],
+        [sys.executable, "-c", DIGEST, motion],
         env={**os.environ, **dict.fromkeys(variables, threads)},
         capture_output=True,
         text=True,
         check=True,
     )
-    made = forecasters("dyskinetic", "test")
+    made = forecasters(motion, "test")
     names = ("autoregression", "kalman")
     here = [made.linear(name).weights for name in names]
     here.append(made.forecast_track("residual", made.paths()[0, :240].reshape(60, 4, 3), 0))

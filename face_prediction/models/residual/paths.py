@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from face_prediction.models.residual.adaptive import FaceState, PeopleFit
 from face_prediction.models.residual.experts import SHAPES, Floats, LinearExpert
@@ -28,9 +29,10 @@ EXPERTS = (
     LinearExpert(0, 8, 2, differences=True),
     LinearExpert(0, 4, 2, differences=True),
 )
-"""Chosen, as `RIDGE` is, by the errors on dyskinetic, sway and recorded motion."""
+"""Chosen, as `RIDGE` is, by the errors on people that fits to dyskinetic, sway and recorded motion
+hold out."""
 
-RIDGE = 1e-6
+RIDGE = 1e-8
 """Less than a face's: it has only to keep the fit from failing where a motion is exactly linear."""
 
 FACE_SIDE = 0.21
@@ -38,8 +40,6 @@ FACE_SIDE = 0.21
 
 LEAST_PEOPLE = 4
 """Of whom three quarters are fitted to, and the errors measured on the others."""
-
-_DIGITS = 6
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,7 @@ class FollowedPaths:
 def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
     """Fit residual prediction to paths (E, T, 3) m, each of another person.
 
-    Coefficients are rounded to six digits, so that the number of threads of BLAS, which sums in
-    another order, changes nothing.
+    BLAS has one thread for as long as this takes: with more it sums in another order.
 
     Raises:
         RequestError: they are fewer than four.
@@ -114,29 +113,22 @@ def fit_paths(paths: NDArray[np.floating]) -> PathPredictor:
 
     if len(paths) < LEAST_PEOPLE:
         raise RequestError(f"paths of {len(paths)} people; residual needs {LEAST_PEOPLE} or more")
+    with threadpool_limits(1, user_api="blas"):
+        people = _fit(paths)
+    knots = np.concatenate([[0], people.horizons])
+    spline = CubicSpline(knots, np.eye(len(knots)))
+    return PathPredictor(people, spline(np.arange(1, HORIZON + 1))[:, 1:])
+
+
+def _fit(paths: NDArray[np.floating]) -> PeopleFit:
     count = 3 * len(paths) // 4
     fitted, held_out = (list(path_series(part)) for part in (paths[:count], paths[count:]))
     people = fit_people(fitted, [str(number // 2) for number in range(len(fitted))], EXPERTS, RIDGE)
-    people = replace(
-        people,
-        unlearnt=people.recent - 1,
-        linear=tuple(
-            replace(
-                fit,
-                people=_rounded(fit.people),
-                precision=None if fit.precision is None else _rounded(fit.precision),
-            )
-            for fit in people.linear
-        ),
-    )
+    people = replace(people, unlearnt=people.recent - 1)
     no_shapes = np.zeros((SHAPES, 2 * NUM_LANDMARKS))
     tried = trial(ResidualFit(no_shapes, people, IntervalFit.unknown()), held_out)
     made, mixed = ([pair[part] for pair in tried] for part in range(2))
-    usual = usual_errors(made, mixed, held_out, people.pace)
-    knots = np.concatenate([[0], people.horizons])
-    spline = CubicSpline(knots, np.eye(len(knots)))
-    between = spline(np.arange(1, HORIZON + 1))[:, 1:]
-    return PathPredictor(replace(people, usual=_rounded(usual)), between)
+    return replace(people, usual=usual_errors(made, mixed, held_out, people.pace))
 
 
 def path_series(paths: NDArray[np.floating]) -> Floats:
@@ -144,11 +136,3 @@ def path_series(paths: NDArray[np.floating]) -> Floats:
     series = np.zeros((2 * len(paths), paths.shape[1], 2))
     series[::2], series[1::2, :, 0] = paths[..., 1:], paths[..., 0]
     return series / FACE_SIDE
-
-
-def _rounded(values: Floats) -> Floats:
-    """The values with six significant digits."""
-    with np.errstate(divide="ignore"):
-        size = np.floor(np.log10(np.abs(values)))
-    unit = 10.0 ** np.where(np.isfinite(size), size - _DIGITS + 1, 0.0)
-    return np.round(values / unit) * unit
