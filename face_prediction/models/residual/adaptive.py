@@ -191,7 +191,7 @@ class Mixture:
         return np.maximum(mean, LEAST_PACE)
 
     def known(self) -> NDArray[np.int64]:
-        """Horizons (K,) whose forecast was made from a frame that was seen."""
+        """Horizons (K,) whose forecast was made from a frame that was seen and is learnt from."""
         horizons, oldest = self.fit.horizons, self.frames - 1 - self.fit.unlearnt
         return horizons[: int(np.searchsorted(horizons, oldest, side="right"))]
 
