@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import wave
 from pathlib import Path
 
@@ -53,9 +54,19 @@ def test_joined_parts_hold_every_frame_in_order(codec: str, tmp_path: Path) -> N
         np.testing.assert_array_equal(read, frames)
 
 
-def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
-    frames = make_frames(8, size=SIZE)
-    first, second = (write(tmp_path / f"{n}.mp4", frames, VideoEncoding()) for n in "ab")
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be taken away here")
+@pytest.mark.parametrize("codec", VIDEO_CODECS)
+def test_the_same_frames_give_the_same_bytes_on_any_number_of_cores(
+    codec: str, tmp_path: Path
+) -> None:
+    frames, encoding = make_frames(4, size=(480, 640)), VideoEncoding(codec, VIDEO_CODECS[codec])
+    first = write(tmp_path / "all.mp4", frames, encoding)
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        second = write(tmp_path / "one.mp4", frames, encoding)
+    finally:
+        os.sched_setaffinity(0, cores)
     assert first.read_bytes() == second.read_bytes()
 
 

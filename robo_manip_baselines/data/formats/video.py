@@ -115,6 +115,8 @@ class VideoWriter:
         )
         stream.height, stream.width = height, width
         stream.pix_fmt = encoding.pixel_format
+        if encoding.encoder.startswith("libx264"):
+            stream.codec_context.thread_count = 1  # or the bytes depend on the number of cores
         self._stream, self._frames, self._fps = stream, 0, fps
 
     def add(self, image: Image) -> None:
